@@ -1,0 +1,48 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""`holoreel COMMAND ...`: one module per command, imported only when it is asked for."""
+
+import importlib
+import sys
+
+from ..errors import HoloreelError
+
+# Each module `core/cli/<name>.py` (dashes become underscores) has one function `run`; its arguments are the command line.
+COMMANDS = {
+    "synth": "render a multi-view capture from a Blender scene",
+    "train": "train a reel from a capture",
+    "render": "render a reel, PLY or .splatv from given cameras",
+    "eval": "measure a reel against the held-out views of its capture",
+    "info": "say what a reel, PLY, .splatv or capture holds, and what is wrong with it",
+    "bench": "measure the kernels on this machine",
+    "doctor": "say what works on this machine, and how to get what does not",
+}
+
+
+def usage() -> str:
+    """Return the overview that `holoreel --help` prints."""
+    rows = "\n".join(f"  {name:<8} {text}" for name, text in COMMANDS.items())
+    return f"usage: holoreel COMMAND ...\n\n{rows}\n\n`holoreel COMMAND --help` explains one command."
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run one command; return the exit status (2 for anything the user can mend)."""
+    arguments = sys.argv[1:] if arguments is None else arguments
+    if not arguments or arguments[0] in ("-h", "--help"):
+        print(usage())
+        return 0 if arguments else 2
+    name, rest = arguments[0], arguments[1:]
+    if name not in COMMANDS:
+        print(f"holoreel: no command '{name}'; take one of {', '.join(COMMANDS)}.", file=sys.stderr)
+        return 2
+    import tyro
+
+    module = importlib.import_module(f".{name.replace('-', '_')}", __name__)
+    try:
+        tyro.cli(module.run, prog=f"holoreel {name}", args=rest)
+    except HoloreelError as error:
+        print(f"holoreel {name}: {error}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        print(f"\nholoreel {name}: stopped.", file=sys.stderr)
+        return 130
+    return 0
