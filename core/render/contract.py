@@ -1,0 +1,75 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""What every rasterizer backend promises. Backends: `cpu` (our C++ kernels) and `reference` (plain torch, the oracle).
+
+Each backend module has the two functions `rasterize` and `rasterize_spacetime` with the signatures below; both are
+differentiable with respect to every tensor argument.
+
+    rasterize(means, quats, scales, opacities, features, camera, background=None, rules=Rules(), density=None) -> Rendering
+        3D Gaussians: means (N,3), quats (N,4) wxyz unnormalized, scales (N,3) linear, opacities (N,) in [0,1],
+        features (N,C).
+    rasterize_spacetime(gaussians: SpacetimeTensors, time, camera, background=None, rules=Rules(), density=None) -> Rendering
+        Spacetime Gaussians at `time` (Eqs. 6-9), evaluated and projected in one pass.
+
+`camera` is a `holoreel.core.camera.Camera` (PINHOLE); `background` a (C,) tensor or None for black.
+"""
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+from torch import Tensor
+
+
+@dataclass(frozen=True)
+class Rules:
+    """The splatting rules, with the authors' defaults, so that a model renders as it was trained.
+
+    A pixel skips a Gaussian whose alpha is under `alpha_min`, caps alpha at `alpha_max`, and stops before the Gaussian
+    that would take its transmittance under `transmittance_min`. `low_pass` (px²) is added to the diagonal of the 2D
+    covariance. Gaussians nearer than `near` are skipped. `x/z` and `y/z` in the Jacobian alone are clamped to
+    `jacobian_clamp` times half the field of view's tangent.
+    """
+
+    alpha_max: float = 0.99
+    alpha_min: float = 1.0 / 255.0
+    transmittance_min: float = 1e-4
+    low_pass: float = 0.3
+    near: float = 0.2
+    jacobian_clamp: float = 1.3
+
+
+class SpacetimeTensors(NamedTuple):
+    """The fields of `SpacetimeGaussians`, as torch tensors of the same shapes and meanings."""
+
+    means: Tensor
+    motions: Tensor
+    quats: Tensor
+    omegas: Tensor
+    log_scales: Tensor
+    opacity_logits: Tensor
+    features: Tensor
+    trbf_centers: Tensor
+    trbf_log_scales: Tensor
+
+
+class Rendering(NamedTuple):
+    """One picture: `features` (H,W,C) with the background composited, `alpha` (H,W), `depth` (H,W).
+
+    `depth` is the alpha-weighted mean of camera-space z (0 where alpha is 0); it carries gradient like the rest.
+    """
+
+    features: Tensor
+    alpha: Tensor
+    depth: Tensor
+
+
+@dataclass
+class DensityStats:
+    """What density control needs; backward adds to these tensors in place, once per rendered picture.
+
+    `gradient`: (N,) sum of |dL/d(mean in pixels)|; `views`: (N,) int32 how many pictures saw each Gaussian;
+    `radius_px`: (N,) largest projected radius (3 sigma of the longer axis) seen so far.
+    """
+
+    gradient: Tensor
+    views: Tensor
+    radius_px: Tensor
