@@ -1,20 +1,67 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Spacetime Gaussians as arrays, and their evaluation at a time (Spacetime Gaussians, Sec. 4.1). Needs numpy only."""
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+from typing import Any, Self
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 Array = NDArray[np.float32]
+
+OPACITY_MIN = 1.0 / 255.0  # under this no pixel can show a Gaussian: the rasterizers skip smaller alphas
+ALWAYS_LOG_SCALE = (
+    16.0  # log of a width at which the temporal opacity is 1 to the last float32 bit, anywhere near [0, 1]
+)
+
+# Shape of one row, and the range in which float32 arithmetic on it stays finite (exp of a scale, the square of a
+# quaternion). Rows outside are as useless as NaN. Widths have no upper limit but finiteness: wide means always visible.
+ROWS: dict[str, tuple[tuple[int, ...], float, float]] = {
+    "means": ((3,), -1e12, 1e12),
+    "motions": ((3, 3), -1e12, 1e12),
+    "quats": ((4,), -1e12, 1e12),
+    "omegas": ((4,), -1e12, 1e12),
+    "log_scales": ((3,), -40.0, 40.0),
+    "opacity_logits": ((), -1e30, 1e30),
+    "features": ((3,), -1e12, 1e12),
+    "trbf_centers": ((), -1e6, 1e6),
+    "trbf_log_scales": ((), -40.0, 1e30),
+}
+FEATURES = {3: "lite", 9: "full"}
+
+
+@dataclass
+class EvaluatedGaussians:
+    """N Gaussians at one time, ready to be drawn. Rows are those of the model, dead ones included; see `alive`."""
+
+    means: Array  # (N, 3) μ(t), Eq. 8
+    quats: Array  # (N, 4) q(t) of Eq. 9 as w x y z, unit length; (1, 0, 0, 0) where the sum is zero
+    scales: Array  # (N, 3) standard deviations, in scene units
+    opacities: Array  # (N,) σ(t) of Eq. 7, in [0, 1]
+    features: Array  # (N, 3) color, or (N, 9) with the time part already multiplied by t - μ^τ (Eq. 10)
+
+    def __len__(self) -> int:
+        return len(self.means)
+
+    @property
+    def alive(self) -> NDArray[np.int64]:
+        """Rows that a pixel can show: opacity of at least 1/255."""
+        return np.flatnonzero(self.opacities >= OPACITY_MIN)
+
+    def take(self, index: ArrayLike) -> Self:
+        """Return the rows that `index` (integers or a mask) selects."""
+        return type(self)(**{field.name: getattr(self, field.name)[index] for field in fields(self)})
 
 
 @dataclass
 class SpacetimeGaussians:
     """The parameters of N Spacetime Gaussians, raw as they are trained and stored.
 
-    `features` has 3 columns for a lite model (linear display-referred RGB, no offset, no harmonics) and 9 for a full one
+    `features` has 3 columns for a lite model (display-referred RGB, no offset, no harmonics) and 9 for a full one
     (base, direction, time: Eq. 10). Time is normalized: a segment spans [0, 1).
+
+    Whatever the arrays are given as, they are held as C-contiguous float32; a wrong shape is a ValueError.
     """
 
     means: Array  # (N, 3) position at the temporal center, b_0 of Eq. 8
@@ -27,5 +74,150 @@ class SpacetimeGaussians:
     trbf_centers: Array  # (N,) μ^τ of Eq. 7
     trbf_log_scales: Array  # (N,) log of the width w; s^τ = w⁻²
 
+    def __post_init__(self) -> None:
+        count = len(self.means)
+        for name, (row, _, _) in ROWS.items():
+            # Not ascontiguousarray, which would turn a scalar into one row.
+            array = np.asarray(getattr(self, name), dtype=np.float32, order="C")
+            allowed = [(count, width) for width in FEATURES] if name == "features" else [(count, *row)]
+            if array.shape not in allowed:
+                raise ValueError(f"{name} has shape {array.shape}, not {' or '.join(map(str, allowed))}")
+            setattr(self, name, array)
+
     def __len__(self) -> int:
         return len(self.means)
+
+    @property
+    def variant(self) -> str:
+        """`lite` (3 feature columns) or `full` (9)."""
+        return FEATURES[self.features.shape[1]]
+
+    def take(self, index: ArrayLike) -> Self:
+        """Return the rows that `index` (integers, a slice or a mask) selects."""
+        return type(self)(**{name: getattr(self, name)[index] for name in ROWS})
+
+    def evaluate(self, time: float) -> EvaluatedGaussians:
+        """Evaluate all Gaussians at `time` (Eqs. 7 to 10; the width is exp(trbf_log_scale), without the paper's 1/2).
+
+        Computed in float64 and rounded once, so that other evaluations can be measured against this one. A row whose
+        parameters are not finite comes out not finite.
+        """
+        dt = time - self.trbf_centers.astype(np.float64)
+        with np.errstate(over="ignore", under="ignore", invalid="ignore", divide="ignore"):
+            quats = self.quats + dt[:, None] * self.omegas
+            lengths = np.linalg.norm(quats, axis=1, keepdims=True)
+            quats = np.where(lengths == 0.0, [1.0, 0.0, 0.0, 0.0], quats / np.where(lengths == 0.0, 1.0, lengths))
+            temporal = np.exp(-np.square(dt * np.exp(-self.trbf_log_scales.astype(np.float64))))
+            opacities = sigmoid(self.opacity_logits.astype(np.float64)) * temporal
+            features = self.features.astype(np.float64)
+            if self.variant == "full":
+                features[:, 6:] *= dt[:, None]
+            return EvaluatedGaussians(
+                self._positions(dt).astype(np.float32),
+                quats.astype(np.float32),
+                np.exp(self.log_scales.astype(np.float64)).astype(np.float32),
+                opacities.astype(np.float32),
+                features.astype(np.float32),
+            )
+
+    def _positions(self, dt: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Positions (N, 3) at `dt` (N,) after each temporal center: the cubic of Eq. 8 by Horner's rule."""
+        step, motions = dt[:, None], self.motions.astype(np.float64)
+        return self.means + step * (motions[:, 0] + step * (motions[:, 1] + step * motions[:, 2]))
+
+    def lifetimes(self) -> NDArray[np.float64]:
+        """Return (N, 2) first and last time at which each Gaussian reaches opacity 1/255; NaN where it never does."""
+        with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
+            peak = sigmoid(self.opacity_logits.astype(np.float64))
+            half = np.exp(self.trbf_log_scales.astype(np.float64)) * np.sqrt(np.log(peak / OPACITY_MIN))
+        return np.stack([self.trbf_centers - half, self.trbf_centers + half], axis=1)
+
+    def bounds(self, start: float = 0.0, end: float = 1.0) -> NDArray[np.float64] | None:
+        """Return the box (2, 3), lowest and highest corner, of all visible centers in [start, end], or None if none is.
+
+        Exact: a cubic takes its extremes where its derivative vanishes or at the ends of the time it is visible.
+        """
+        lives = self.lifetimes()
+        seen = (lives[:, 0] <= end) & (lives[:, 1] >= start) & ~self.bad_rows()
+        if not seen.any():
+            return None
+        visible, lives = self.take(seen), np.clip(lives[seen], start, end)
+        first, last = (lives - visible.trbf_centers[:, None]).T
+        places = [visible._positions(first), visible._positions(last)]
+        for turn in visible._turning_points():
+            places.append(visible._positions(np.where((turn > first) & (turn < last), turn, first)))
+        return np.stack([np.min(places, axis=(0, 1)), np.max(places, axis=(0, 1))])
+
+    def _turning_points(self) -> NDArray[np.float64]:
+        """Return (6, N) times after the temporal center where an axis' derivative vanishes; not finite where none."""
+        # The derivative is linear + 2 · half · dt + 3 · cubic · dt².
+        linear, half, cubic = self.motions.astype(np.float64).transpose(1, 2, 0)
+        with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
+            # The form that does not cancel when the cubic is small.
+            stable = -(half + np.copysign(np.sqrt(half * half - 3.0 * cubic * linear), half))
+            return np.concatenate([stable / (3.0 * cubic), linear / stable])
+
+    def bad_rows(self) -> NDArray[np.bool_]:
+        """Return an (N,) mask of rows that cannot be drawn: a value is NaN, infinite, or beyond what `ROWS` allows."""
+        bad = np.zeros(len(self), dtype=bool)
+        for name in ROWS:
+            bad |= self._bad_values(name)
+        return bad
+
+    def _bad_values(self, name: str) -> NDArray[np.bool_]:
+        _, lowest, highest = ROWS[name]
+        values = getattr(self, name).reshape(len(self), -1)
+        # Comparisons with NaN are false, so "not inside" catches it.
+        return ~((values >= lowest) & (values <= highest)).all(axis=1)
+
+    def without_bad_rows(self) -> Self:
+        """Return the model without its `bad_rows`; the model itself where there are none."""
+        bad = self.bad_rows()
+        return self.take(~bad) if bad.any() else self
+
+    def problems(self) -> list[str]:
+        """Say in sentences what is unusual about this model; an empty list means nothing is."""
+        found = []
+        for name in ROWS:
+            if count := int(self._bad_values(name).sum()):
+                found.append(f"{rows(count)} with {name} that are not finite or beyond any use.")
+        good = self.without_bad_rows()
+        checks = {
+            "zero quaternions and no rotation speed (drawn unrotated)": ~(good.quats.any(1) | good.omegas.any(1)),
+            "an opacity that never reaches 1/255 (never visible)": ~(sigmoid(good.opacity_logits) >= OPACITY_MIN),
+            "a temporal width under 1/1000 of the segment (a flash)": good.trbf_log_scales < np.log(1e-3),
+            "a life that misses the segment [0, 1) (never visible)": good._never_in_segment(),
+            "a scale above 1000 times the median (fog or streaks)": good._huge(),
+        }
+        found += [f"{rows(int(mask.sum()))} with {text}." for text, mask in checks.items() if mask.any()]
+        return found
+
+    def _never_in_segment(self) -> NDArray[np.bool_]:
+        lives = self.lifetimes()
+        return (lives[:, 1] < 0.0) | (lives[:, 0] >= 1.0)
+
+    def _huge(self) -> NDArray[np.bool_]:
+        largest = self.log_scales.max(axis=1, initial=-np.inf)
+        return largest > np.median(largest) + np.log(1000.0) if len(self) else np.zeros(0, dtype=bool)
+
+
+def rows(count: int) -> str:
+    """Return `1 row` or `1,234 rows`, for reports."""
+    return "1 row" if count == 1 else f"{count:,} rows"
+
+
+def concatenate(models: Sequence[SpacetimeGaussians]) -> SpacetimeGaussians:
+    """Return all rows of `models` (at least one, all lite or all full) in one model."""
+    if len({model.variant for model in models}) != 1:
+        raise ValueError("only models of one variant can be joined")
+    return SpacetimeGaussians(**{name: np.concatenate([getattr(model, name) for model in models]) for name in ROWS})
+
+
+def sigmoid(values: NDArray[Any]) -> NDArray[Any]:
+    """Return 1 / (1 + e⁻ˣ), without overflow."""
+    return 0.5 * (1.0 + np.tanh(0.5 * values))
+
+
+def logit(values: NDArray[Any]) -> NDArray[Any]:
+    """Return the inverse of `sigmoid`, for values inside (0, 1)."""
+    return np.log(values) - np.log1p(-values)
