@@ -5,8 +5,8 @@ Axes are OpenCV's (x right, y down, z forward); pixel centers lie at +0.5, so th
 extrinsics are world-to-camera. Other conventions are converted where files are read and written, once.
 """
 
-import json
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -15,15 +15,40 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from .errors import HoloreelError
+from .files import read_json, write_json
 
-MODELS = ("PINHOLE",)
+Array = NDArray[np.float64]
+
+MAX_SIZE = 1 << 16  # pixels along one side
+RIGID_TOLERANCE = 1e-3  # largest entry of RᵀR − 1 that still counts as rounding
 
 
 @dataclass(frozen=True)
+class LensModel:
+    """How one of COLMAP's camera models maps camera space to the plane z = 1 (before fx, fy, cx, cy) and back."""
+
+    to_plane: Callable[["Camera", Array], Array]  # points (N, 3) -> (N, 2)
+    from_plane: Callable[["Camera", Array], Array]  # (N, 2) -> directions (N, 3) with z = 1
+
+
+def _pinhole_to_plane(_camera: "Camera", points: Array) -> Array:
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return points[:, :2] / points[:, 2:]
+
+
+def _pinhole_from_plane(_camera: "Camera", plane: Array) -> Array:
+    return np.concatenate([plane, np.ones((len(plane), 1))], axis=1)
+
+
+MODELS: dict[str, LensModel] = {"PINHOLE": LensModel(_pinhole_to_plane, _pinhole_from_plane)}
+
+
+@dataclass(frozen=True, eq=False)
 class Camera:
     """One calibrated camera.
 
     `fx fy cx cy` are in pixels; `world_to_camera` is 4 × 4 with an orthonormal rotation; `model` is COLMAP's name.
+    Raises `HoloreelError` naming a field that is not possible. A rotation that is off by rounding is made orthonormal.
     """
 
     width: int
@@ -32,25 +57,189 @@ class Camera:
     fy: float
     cx: float
     cy: float
-    world_to_camera: NDArray[np.float64] = field(default_factory=lambda: np.eye(4))
+    world_to_camera: Array = field(default_factory=lambda: np.eye(4))
     model: str = "PINHOLE"
     name: str = ""
 
+    def __post_init__(self) -> None:
+        set_field = object.__setattr__  # the dataclass is frozen for everybody else
+        if self.model not in MODELS:
+            raise self._error("model", f"{self.model!r} is not supported; undistort it to one of {', '.join(MODELS)}")
+        for key in ("width", "height"):
+            set_field(self, key, self._size(key))
+        for key in ("fx", "fy", "cx", "cy"):
+            set_field(self, key, self._number(key))
+        set_field(self, "world_to_camera", self._rigid())
+
+    def _error(self, key: str, text: str) -> HoloreelError:
+        return HoloreelError(f"camera {self.name!r}: {key} {text}." if self.name else f"camera: {key} {text}.")
+
+    def _number(self, key: str) -> float:
+        value = getattr(self, key)
+        if isinstance(value, bool) or not isinstance(value, (int, float, np.number)) or not math.isfinite(value):
+            raise self._error(key, f"must be a finite number, not {value!r}")
+        if key in ("fx", "fy") and value <= 0:
+            raise self._error(key, f"must be positive, not {value!r}")
+        return float(value)
+
+    def _size(self, key: str) -> int:
+        value = self._number(key)
+        if value != int(value) or not 1 <= value <= MAX_SIZE:
+            raise self._error(key, f"must be a whole number of pixels from 1 to {MAX_SIZE}, not {value:g}")
+        return int(value)
+
+    def _rigid(self) -> Array:
+        try:
+            matrix = np.array(self.world_to_camera, dtype=np.float64)
+        except (TypeError, ValueError) as error:
+            raise self._error("world_to_camera", "must be 4 rows of 4 numbers") from error
+        if matrix.shape != (4, 4):
+            raise self._error("world_to_camera", f"must be 4 rows of 4 numbers, not of shape {matrix.shape}")
+        if not np.isfinite(matrix).all():
+            raise self._error("world_to_camera", "holds NaN or infinity")
+        rotation = matrix[:3, :3]
+        offset = float(np.abs(rotation.T @ rotation - np.eye(3)).max())
+        if offset > RIGID_TOLERANCE or np.linalg.det(rotation) < 0 or np.abs(matrix[3] - (0, 0, 0, 1)).max() > 1e-6:
+            raise self._error("world_to_camera", "must be a rotation and a translation (no scale, shear or mirroring)")
+        if offset > 1e-12:
+            left, _, right = np.linalg.svd(rotation)
+            matrix[:3, :3] = left @ right
+        matrix[3] = (0, 0, 0, 1)
+        matrix.flags.writeable = False
+        return matrix
+
     @property
-    def K(self) -> NDArray[np.float64]:
+    def K(self) -> Array:
         """Intrinsics as a 3 × 3 matrix."""
         return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
 
     @property
-    def camera_to_world(self) -> NDArray[np.float64]:
+    def camera_to_world(self) -> Array:
         """The inverse extrinsics, 4 × 4 (exact for a rigid transform)."""
-        rotation = self.world_to_camera[:3, :3].T
-        pose = np.eye(4)
-        pose[:3, :3] = rotation
-        pose[:3, 3] = -rotation @ self.world_to_camera[:3, 3]
-        return pose
+        return invert_rigid(self.world_to_camera)
 
     @property
-    def center(self) -> NDArray[np.float64]:
+    def center(self) -> Array:
         """The point all rays start from, in the world."""
         return self.camera_to_world[:3, 3]
+
+    def project(self, points: ArrayLike) -> tuple[Array, Array]:
+        """Project world points (N, 3) to pixels (N, 2) and depths (N,), the z of camera space.
+
+        A point is in front of the camera where z > 0; pixels of others mean nothing.
+        """
+        local = np.asarray(points, np.float64) @ self.world_to_camera[:3, :3].T + self.world_to_camera[:3, 3]
+        plane = MODELS[self.model].to_plane(self, local)
+        return plane * (self.fx, self.fy) + (self.cx, self.cy), local[:, 2]
+
+    def unproject(self, uv: ArrayLike, z: ArrayLike) -> Array:
+        """Return the world points (N, 3) at pixels `uv` (N, 2) and planar depths `z` (N,)."""
+        local = self._directions(uv) * np.asarray(z, np.float64)[:, None]
+        return self._to_world(local) + self.center
+
+    def rays(self, pixels: ArrayLike | None = None) -> tuple[Array, Array]:
+        """Return world-space origins (N, 3) and unit directions (N, 3) through `pixels` (N, 2).
+
+        Without `pixels`: through the centers of all pixels, row by row.
+        """
+        directions = self._to_world(self._directions(self.pixel_centers() if pixels is None else pixels))
+        directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+        return np.broadcast_to(self.center, directions.shape).copy(), directions
+
+    def pixel_centers(self) -> Array:
+        """The centers of all pixels, (height · width, 2), row by row."""
+        v, u = np.mgrid[: self.height, : self.width]
+        return np.stack([u.ravel() + 0.5, v.ravel() + 0.5], axis=1)
+
+    def _directions(self, uv: ArrayLike) -> Array:
+        plane = (np.asarray(uv, np.float64) - (self.cx, self.cy)) / (self.fx, self.fy)
+        return MODELS[self.model].from_plane(self, plane)
+
+    def _to_world(self, directions: Array) -> Array:
+        return directions @ self.world_to_camera[:3, :3]
+
+    def scaled(self, width: int, height: int) -> "Camera":
+        """The same camera with another resolution: it sees the same, in `width` × `height` pixels."""
+        x, y = width / self.width, height / self.height
+        return replace(self, width=width, height=height, fx=self.fx * x, fy=self.fy * y, cx=self.cx * x, cy=self.cy * y)
+
+    @classmethod
+    def look_at(
+        cls,
+        eye: ArrayLike,
+        target: ArrayLike,
+        up: ArrayLike = (0.0, 0.0, 1.0),
+        *,
+        width: int,
+        height: int,
+        fx: float,
+        fy: float | None = None,
+        name: str = "",
+    ) -> "Camera":
+        """A camera at `eye` that has `target` in its middle and `up` upward in the picture (`fy` is `fx` unless given).
+
+        Where the view is along `up`, world y (or x) takes its place.
+        """
+        eye = np.asarray(eye, np.float64)
+        forward = np.asarray(target, np.float64) - eye
+        length = float(np.linalg.norm(forward))
+        if not length > 0:
+            raise HoloreelError(f"camera {name!r}: eye and target must be two different points.")
+        forward /= length
+        for candidate in (up, (0.0, 1.0, 0.0), (1.0, 0.0, 0.0)):
+            right = np.cross(forward, np.asarray(candidate, np.float64))
+            if np.linalg.norm(right) > 1e-6:
+                break
+        right /= np.linalg.norm(right)
+        matrix = np.eye(4)
+        matrix[:3, :3] = np.stack([right, np.cross(forward, right), forward])
+        matrix[:3, 3] = -matrix[:3, :3] @ eye
+        return cls(width, height, fx, fx if fy is None else fy, width / 2, height / 2, matrix, name=name)
+
+    def to_json(self) -> dict[str, Any]:
+        """Return what CAMERA.json holds; `world_to_camera` as 4 rows."""
+        keys = ("model", "width", "height", "fx", "fy", "cx", "cy")
+        value = {key: getattr(self, key) for key in keys}
+        value["world_to_camera"] = self.world_to_camera.tolist()
+        return value | ({"name": self.name} if self.name else {})
+
+    @classmethod
+    def from_json(cls, value: dict[str, Any], source: str | Path = "camera") -> "Camera":
+        """Make a camera from `to_json`'s dictionary; errors begin with `source`."""
+        needed = {"model", "width", "height", "fx", "fy", "cx", "cy", "world_to_camera"}
+        model = value.get("model")
+        if model is not None and model not in MODELS:
+            raise HoloreelError(f"{source}: model {model!r} is not supported; undistort it to {', '.join(MODELS)}.")
+        if missing := sorted(needed - set(value)):
+            raise HoloreelError(f"{source}: {missing[0]} is missing; a camera has {', '.join(sorted(needed))}.")
+        if unknown := sorted(set(value) - needed - {"name"}):
+            raise HoloreelError(f"{source}: {unknown[0]} is not a field of a {model} camera; take it out.")
+        try:
+            return cls(**value)
+        except HoloreelError as error:
+            raise HoloreelError(f"{source}: {error}") from error
+
+
+def focal_from_fov(fov_degrees: float, pixels: int) -> float:
+    """Focal length in pixels of a pinhole whose `pixels` along one side span `fov_degrees`."""
+    if not 0 < fov_degrees < 180:
+        raise HoloreelError(f"a field of view must lie between 0 and 180 degrees, not {fov_degrees:g}.")
+    return pixels / 2 / math.tan(math.radians(fov_degrees) / 2)
+
+
+def invert_rigid(matrix: Array) -> Array:
+    """Invert a 4 × 4 rigid transform."""
+    inverse = np.eye(4)
+    inverse[:3, :3] = matrix[:3, :3].T
+    inverse[:3, 3] = -inverse[:3, :3] @ matrix[:3, 3]
+    return inverse
+
+
+def read_camera(path: str | Path) -> Camera:
+    """Read a CAMERA.json (keys model, width, height, fx, fy, cx, cy, world_to_camera as 4 rows, name optional)."""
+    return Camera.from_json(read_json(path), path)
+
+
+def write_camera(path: str | Path, camera: Camera) -> None:
+    """Write a CAMERA.json, atomically."""
+    write_json(path, camera.to_json())

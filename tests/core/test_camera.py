@@ -1,0 +1,164 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Cameras: projection and its inverse, look-at, scaling, files, and everything that is no camera."""
+
+import json
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from holoreel.core.camera import Camera, focal_from_fov, read_camera, write_camera
+from holoreel.core.errors import HoloreelError
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+numbers = st.floats(-20, 20, allow_nan=False)
+vectors = st.tuples(numbers, numbers, numbers).map(np.array)
+
+
+def rotation_from_quaternion(w: float, x: float, y: float, z: float) -> np.ndarray:
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+
+
+@st.composite
+def cameras(draw: st.DrawFn) -> Camera:
+    quat = np.array(draw(st.tuples(*[st.floats(-1, 1)] * 4).filter(lambda q: np.linalg.norm(q) > 0.1)))
+    matrix = np.eye(4)
+    matrix[:3, :3] = rotation_from_quaternion(*(quat / np.linalg.norm(quat)))
+    matrix[:3, 3] = draw(vectors)
+    focal, center = st.floats(20, 3000), st.floats(-500, 1500)
+    return Camera(
+        draw(st.integers(1, 2000)), draw(st.integers(1, 2000)),
+        draw(focal), draw(focal), draw(center), draw(center), matrix,
+    )  # fmt: skip
+
+
+@given(cameras(), st.integers(0, 2**32 - 1))
+@settings(max_examples=60, deadline=None)
+def test_project_undoes_unproject_and_rays_hit(camera: Camera, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    uv = rng.uniform(0, 1, (30, 2)) * (camera.width, camera.height)
+    z = rng.uniform(0.1, 50, 30)
+    points = camera.unproject(uv, z)
+    uv_back, z_back = camera.project(points)
+    assert np.allclose(uv_back, uv, atol=1e-6, rtol=1e-9)
+    assert np.allclose(z_back, z, atol=1e-8, rtol=1e-9)
+    origins, directions = camera.rays(uv)
+    assert np.allclose(np.linalg.norm(directions, axis=1), 1)
+    distance = np.linalg.norm(points - origins, axis=1)
+    assert np.allclose(origins + directions * distance[:, None], points, atol=1e-7 * (1 + distance.max()))
+    homogeneous = np.concatenate([points, np.ones((30, 1))], 1) @ camera.world_to_camera.T
+    expected = homogeneous[:, :3] @ camera.K.T
+    assert np.allclose(expected[:, :2] / expected[:, 2:], uv, atol=1e-6)
+
+
+@given(cameras())
+@settings(max_examples=30, deadline=None)
+def test_json_round_trip_is_exact(camera: Camera) -> None:
+    back = Camera.from_json(json.loads(json.dumps(replace(camera, name="a").to_json())))
+    assert back.name == "a"
+    assert np.array_equal(back.world_to_camera, camera.world_to_camera)
+    assert (back.fx, back.fy, back.cx, back.cy, back.width) == (
+        camera.fx, camera.fy, camera.cx, camera.cy, camera.width,
+    )  # fmt: skip
+    assert np.allclose(camera.camera_to_world @ camera.world_to_camera, np.eye(4), atol=1e-9)
+    assert np.allclose(camera.world_to_camera[:3, :3] @ camera.center + camera.world_to_camera[:3, 3], 0, atol=1e-9)
+
+
+@given(vectors, vectors, vectors)
+@settings(max_examples=80, deadline=None)
+def test_look_at_centers_target_and_keeps_up_up(eye: np.ndarray, target: np.ndarray, up: np.ndarray) -> None:
+    if np.linalg.norm(eye - target) < 1e-3 or np.linalg.norm(up) < 1e-3:
+        return
+    camera = Camera.look_at(eye, target, up, width=320, height=180, fx=300.0)
+    uv, z = camera.project([target])
+    assert np.allclose(uv, [[160, 90]], atol=1e-6)
+    assert np.isclose(z[0], np.linalg.norm(eye - target))
+    assert np.allclose(camera.center, eye, atol=1e-9)
+    view, upward = (target - eye) / z[0], up / np.linalg.norm(up)
+    if np.linalg.norm(np.cross(view, upward)) > 1e-3:
+        higher, _ = camera.project([target + 1e-3 * z[0] * upward])
+        assert abs(higher[0, 0] - 160) < 1e-6
+        assert higher[0, 1] < 90
+
+
+def test_look_straight_down() -> None:
+    camera = Camera.look_at((0, 0, 5), (0, 0, 0), width=10, height=10, fx=10)
+    assert np.allclose(camera.project([[0, 1, 0]])[0], [[5, 3]])
+
+
+def test_convention_by_hand() -> None:
+    """x right, y down, z forward; the middle of the image is (W/2, H/2)."""
+    camera = Camera(4, 2, 10, 20, 2, 1)
+    uv, z = camera.project([[0, 0, 2], [0.2, 0, 2], [0, 0.1, 2]])
+    assert np.allclose(uv, [[2, 1], [3, 1], [2, 2]])
+    assert np.allclose(z, 2)
+    centers = camera.pixel_centers()
+    assert centers[:5].tolist() == [[0.5, 0.5], [1.5, 0.5], [2.5, 0.5], [3.5, 0.5], [0.5, 1.5]]
+    assert camera.rays()[1].shape == (8, 3)
+
+
+def test_scaled_sees_the_same() -> None:
+    camera = Camera.look_at((3, -4, 2), (0, 0, 0), width=320, height=180, fx=300)
+    points = np.random.default_rng(0).uniform(-1, 1, (20, 3))
+    big = camera.scaled(640, 90)
+    assert np.allclose(big.project(points)[0], camera.project(points)[0] * (2, 0.5))
+    assert (big.width, big.height) == (640, 90)
+
+
+def test_focal_from_fov() -> None:
+    assert math.isclose(focal_from_fov(90, 200), 100)
+    with pytest.raises(HoloreelError):
+        focal_from_fov(180, 200)
+
+
+def test_small_rounding_is_mended_and_matrix_is_read_only() -> None:
+    camera = Camera(8, 8, 5, 5, 4, 4, np.diag([1 + 1e-4, 1, 1, 1]))
+    assert np.allclose(camera.world_to_camera, np.eye(4), atol=1e-15)
+    with pytest.raises(ValueError, match="read-only"):
+        camera.world_to_camera[0, 0] = 2
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [
+        ("width", 0), ("width", -1), ("width", 2.5), ("width", 10**9), ("height", math.nan), ("height", "8"),
+        ("fx", 0), ("fx", -3), ("fx", math.inf), ("fy", math.nan), ("fy", None), ("cx", math.nan), ("cy", "a"),
+        ("cx", True), ("model", "FULL_OPENCV"), ("model", None), ("world_to_camera", np.eye(3)),
+        ("world_to_camera", np.diag([2, 2, 2, 1])), ("world_to_camera", np.diag([1, 1, -1, 1])),
+        ("world_to_camera", np.full((4, 4), math.nan)), ("world_to_camera", "abc"), ("world_to_camera", [[1], [1, 2]]),
+        ("world_to_camera", np.zeros((4, 4))), ("world_to_camera", np.ones((4, 4))),
+    ],
+)  # fmt: skip
+def test_impossible_fields_are_named(key: str, value: object) -> None:
+    good = {"width": 8, "height": 8, "fx": 5, "fy": 5, "cx": 4, "cy": 4}
+    with pytest.raises(HoloreelError, match=key):
+        Camera(**(good | {key: value}))
+
+
+def test_camera_file(tmp_path: Path) -> None:
+    path = tmp_path / "CAMERA.json"
+    camera = Camera.look_at((1, 2, 3), (0, 0, 0), width=32, height=18, fx=30, name="middle")
+    write_camera(path, camera)
+    assert np.array_equal(read_camera(path).world_to_camera, camera.world_to_camera)
+    good = json.loads(path.read_text())
+    for change, field in [
+        ({"model": "OPENCV"}, "model"), ({"fx": -1}, "fx"), ({"k1": 0.1}, "k1"), ({"world_to_camera": [[1]]}, "world"),
+    ]:  # fmt: skip
+        path.write_text(json.dumps(good | change))
+        with pytest.raises(HoloreelError, match=rf"CAMERA\.json.*{field}"):
+            read_camera(path)
+    path.write_text(json.dumps({key: good[key] for key in good if key != "cy"}))
+    with pytest.raises(HoloreelError, match=r"CAMERA\.json.*cy is missing"):
+        read_camera(path)
+    for text in ("[1]", "{", '{"a":' * 100000):
+        path.write_text(text)
+        with pytest.raises(HoloreelError, match=r"CAMERA\.json"):
+            read_camera(path)
