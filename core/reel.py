@@ -1,0 +1,310 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The `.reel` manifest, and one door to everything that holds Spacetime Gaussians. Needs numpy only.
+
+A reel is a JSON file `NAME.reel` that ties together payload files beside it (or in folders below it):
+
+    {"kind": "spacetime_gaussians", "version": 1, "fps": 24.0, "frame_start": 1, "frame_count": 50,
+     "bounds": [[x, y, z], [x, y, z]], "up": "Z", "color_space": "display", "decoder": null, "variant": "lite",
+     "segments": [{"file": "NAME.ply", "frame_start": 1, "frame_count": 50}],
+     "files": {"metrics": "metrics.json"}, "provenance": {...}}
+
+Segments follow each other without gap. Frame j of a segment's F frames has the normalized time j / F, in [0, 1).
+"""
+
+from dataclasses import dataclass, field
+from pathlib import Path, PurePosixPath, PureWindowsPath
+from typing import Any
+
+from .errors import HoloreelError
+from .files import read_json, write_json
+from .gaussians.model import SpacetimeGaussians
+from .gaussians.ply import read_ply, write_ply
+from .gaussians.splatv import read_splatv
+
+KIND = "spacetime_gaussians"
+VERSION = 1
+UP_AXES = ("X", "-X", "Y", "-Y", "Z", "-Z")
+COLOR_SPACES = ("display",)  # colors are sRGB as displayed: what was seen in the 8-bit pictures, divided by 255
+BARE_FRAME_COUNT = 50  # what the authors train on, and assumed where a file does not say
+BARE_FPS = 30.0
+
+Bounds = tuple[tuple[float, float, float], tuple[float, float, float]]
+
+
+@dataclass(frozen=True)
+class Segment:
+    """A run of frames that one payload file holds; `file` is relative to the manifest, with forward slashes."""
+
+    file: str
+    frame_start: int
+    frame_count: int
+
+
+@dataclass(frozen=True)
+class Reel:
+    """What a `.reel` manifest says.
+
+    `bounds` is the box of the visible Gaussians' centers (lowest, highest corner), `up` the world axis that points up
+    (None where unknown), `files` names further files by purpose (`config`, `metrics`, `log`); `provenance` is free.
+    """
+
+    path: Path
+    fps: float
+    frame_start: int
+    frame_count: int
+    segments: tuple[Segment, ...]
+    variant: str = "lite"
+    bounds: Bounds | None = None
+    up: str | None = None
+    color_space: str = "display"
+    files: dict[str, str] = field(default_factory=dict)
+    provenance: dict[str, Any] = field(default_factory=dict)
+
+    def locate(self, frame: float) -> tuple[int, float]:
+        """Return the segment that shows `frame` (sub-frames allowed, held at both ends) and its normalized time."""
+        index = 0
+        while index + 1 < len(self.segments) and frame >= self.segments[index + 1].frame_start:
+            index += 1
+        segment = self.segments[index]
+        step = min(max(frame - segment.frame_start, 0.0), float(segment.frame_count))
+        return index, step / segment.frame_count
+
+    def payload(self, segment: int = 0) -> Path:
+        """Return the path of a segment's payload file."""
+        return self.path.parent / self.segments[segment].file
+
+
+@dataclass(frozen=True)
+class Loaded:
+    """Spacetime Gaussians with what is needed to play them, whatever file they came from.
+
+    `kind` is `reel`, `ply` or `splatv`; `report` says in sentences what was assumed and what is unusual. Frame j of
+    `frame_count`, counted from `frame_start`, has the normalized time j / frame_count.
+    """
+
+    gaussians: SpacetimeGaussians
+    path: Path
+    kind: str
+    fps: float
+    frame_start: int
+    frame_count: int
+    up: str | None
+    color_space: str
+    report: list[str]
+    reel: Reel | None = None
+
+    def time_of(self, frame: float) -> float:
+        """Return the normalized time of a frame (sub-frames allowed)."""
+        return (frame - self.frame_start) / self.frame_count
+
+
+def load_gaussians(path: str | Path, segment: int = 0) -> Loaded:
+    """Load a `.reel` (its `segment`-th payload), a `.ply` or a `.splatv`.
+
+    Raises `HoloreelError` for a missing, damaged or unknown file.
+    """
+    path = Path(path)
+    readers = {".ply": read_ply, ".splatv": read_splatv}
+    suffix = path.suffix.lower()
+    if path.is_dir():
+        raise HoloreelError(f"{path} is a folder: give the .reel, .ply or .splatv file inside it.")
+    if suffix == ".reel":
+        return _load_reel(path, segment)
+    if suffix not in readers:
+        raise HoloreelError(f"{path} has the unknown ending '{path.suffix}': give a .reel, .ply or .splatv file.")
+    gaussians, report = readers[suffix](path)
+    assumed = f"{path.name} does not say how long it is: {BARE_FRAME_COUNT} frames at {BARE_FPS:g} fps are assumed."
+    return Loaded(
+        gaussians,
+        path,
+        kind=suffix[1:],
+        fps=BARE_FPS,
+        frame_start=0,
+        frame_count=BARE_FRAME_COUNT,
+        up=None,
+        color_space="display",
+        report=[assumed, *report],
+    )
+
+
+def _load_reel(path: Path, index: int) -> Loaded:
+    reel = read_reel(path)
+    if not 0 <= index < len(reel.segments):
+        raise HoloreelError(f"{path} has no segment {index}: take 0 to {len(reel.segments) - 1}.")
+    segment, payload = reel.segments[index], reel.payload(index)
+    if not payload.is_file():
+        raise HoloreelError(f"{path}: its payload '{segment.file}' is missing; put {payload} beside the reel.")
+    gaussians, report = read_ply(payload)
+    if gaussians.variant != reel.variant:
+        raise HoloreelError(
+            f"{path} says 'variant' {reel.variant}, but '{segment.file}' is {gaussians.variant}: "
+            "correct the variant, or put the right payload beside the reel."
+        )
+    return Loaded(
+        gaussians,
+        path,
+        kind="reel",
+        fps=reel.fps,
+        frame_start=segment.frame_start,
+        frame_count=segment.frame_count,
+        up=reel.up,
+        color_space=reel.color_space,
+        report=report,
+        reel=reel,
+    )
+
+
+def save_gaussians(
+    path: str | Path,
+    gaussians: SpacetimeGaussians,
+    *,
+    fps: float,
+    frame_start: int,
+    frame_count: int,
+    up: str | None = None,
+    files: dict[str, str] | None = None,
+    provenance: dict[str, Any] | None = None,
+) -> Reel:
+    """Write `gaussians` as a reel of one segment: the payload `NAME.ply`, then the manifest `NAME.reel` at `path`."""
+    path = Path(path)
+    box = gaussians.bounds()
+    reel = Reel(
+        path,
+        fps=float(fps),
+        frame_start=frame_start,
+        frame_count=frame_count,
+        segments=(Segment(f"{path.stem}.ply", frame_start, frame_count),),
+        variant=gaussians.variant,
+        bounds=None if box is None else _parse_bounds(path, box.tolist()),
+        up=up,
+        files=files or {},
+        provenance=provenance or {},
+    )
+    check_reel(reel)
+    write_ply(reel.payload(), gaussians)
+    write_reel(reel)
+    return reel
+
+
+def write_reel(reel: Reel) -> None:
+    """Write the manifest at `reel.path`, atomically; payloads should be there already."""
+    check_reel(reel)
+    manifest = {
+        "kind": KIND,
+        "version": VERSION,
+        "fps": reel.fps,
+        "frame_start": reel.frame_start,
+        "frame_count": reel.frame_count,
+        "bounds": reel.bounds,
+        "up": reel.up,
+        "color_space": reel.color_space,
+        "decoder": None,
+        "variant": reel.variant,
+        "segments": [vars(segment) for segment in reel.segments],
+        "files": reel.files,
+        "provenance": reel.provenance,
+    }
+    write_json(reel.path, manifest)
+
+
+def read_reel(path: str | Path) -> Reel:
+    """Read and check a manifest, not its payloads. Raises `HoloreelError` naming the field that is wrong."""
+    path = Path(path)
+    manifest = read_json(path)
+    if manifest.get("kind") != KIND:
+        raise HoloreelError(f"{path}: 'kind' is {manifest.get('kind')!r}, not '{KIND}'; give a reel of Gaussians.")
+    version = manifest.get("version")
+    if not _is_int(version) or version < 1:
+        raise HoloreelError(f"{path}: 'version' is {version!r}, not a positive whole number; write the reel again.")
+    if version > VERSION:
+        raise HoloreelError(
+            f"{path} is a reel of version {version}, this Holoreel reads up to {VERSION}: update Holoreel."
+        )
+    if manifest.get("decoder") is not None:
+        raise HoloreelError(f"{path}: 'decoder' is set, and this Holoreel draws reels without one: update Holoreel.")
+    segments = manifest.get("segments")
+    if not isinstance(segments, list) or not all(isinstance(segment, dict) for segment in segments):
+        raise HoloreelError(f"{path}: 'segments' is not a list of objects; write the reel again.")
+    reel = Reel(
+        path=path,
+        fps=manifest.get("fps"),  # type: ignore[arg-type]  # judged below, with the rest
+        frame_start=manifest.get("frame_start"),  # type: ignore[arg-type]
+        frame_count=manifest.get("frame_count"),  # type: ignore[arg-type]
+        segments=tuple(Segment(*(part.get(key) for key in Segment.__annotations__)) for part in segments),
+        variant=manifest.get("variant", ""),
+        bounds=_parse_bounds(path, manifest.get("bounds")),
+        up=manifest.get("up"),
+        color_space=manifest.get("color_space", ""),
+        files=manifest.get("files", {}),
+        provenance=manifest.get("provenance", {}),
+    )
+    check_reel(reel)
+    return reel
+
+
+def check_reel(reel: Reel) -> None:
+    """Raise `HoloreelError`, naming the field, where a reel does not hold together."""
+
+    def demand(right: bool, name: str, value: Any, wanted: str) -> None:
+        if not right:
+            raise HoloreelError(
+                f"{reel.path}: '{name}' is {value!r}, not {wanted}; correct it or write the reel again."
+            )
+
+    if reel.path.suffix != ".reel":
+        raise HoloreelError(f"{reel.path} does not end in .reel: give it a name like {reel.path.stem or 'name'}.reel.")
+    demand(_is_number(reel.fps) and 0 < reel.fps <= 1000, "fps", reel.fps, "a number from above 0 to 1000")
+    demand(_is_int(reel.frame_start), "frame_start", reel.frame_start, "a whole number")
+    demand(
+        _is_int(reel.frame_count) and reel.frame_count > 0, "frame_count", reel.frame_count, "a positive whole number"
+    )
+    demand(reel.variant in ("lite", "full"), "variant", reel.variant, "'lite' or 'full'")
+    demand(reel.up is None or reel.up in UP_AXES, "up", reel.up, f"null or one of {', '.join(UP_AXES)}")
+    demand(reel.color_space in COLOR_SPACES, "color_space", reel.color_space, f"one of {', '.join(COLOR_SPACES)}")
+    demand(isinstance(reel.provenance, dict), "provenance", reel.provenance, "an object")
+    demand(isinstance(reel.files, dict), "files", reel.files, "an object")
+    for purpose, file in reel.files.items():
+        demand(_is_safe(file), f"files.{purpose}", file, "a relative path below the reel")
+    demand(len(reel.segments) > 0, "segments", [], "a list with at least one segment")
+    expected = reel.frame_start
+    for index, segment in enumerate(reel.segments):
+        at = f"segments[{index}]"
+        demand(_is_safe(segment.file), f"{at}.file", segment.file, "a relative path below the reel")
+        demand(segment.file.endswith(".ply"), f"{at}.file", segment.file, "a .ply file")
+        count = segment.frame_count
+        demand(_is_int(count) and count > 0, f"{at}.frame_count", count, "a positive whole number")
+        start = segment.frame_start
+        demand(_is_int(start) and start == expected, f"{at}.frame_start", start, f"{expected}, without gap")
+        expected += segment.frame_count
+    total = expected - reel.frame_start
+    demand(reel.frame_count == total, "frame_count", reel.frame_count, f"{total}, the sum of its segments")
+
+
+def _parse_bounds(path: Path, value: Any) -> Bounds | None:
+    if value is None:
+        return None
+    try:
+        (a, b, c), (d, e, f) = value
+    except (TypeError, ValueError):
+        a = b = c = d = e = f = None
+    if not all(_is_number(x) for x in (a, b, c, d, e, f)) or a > d or b > e or c > f:
+        raise HoloreelError(
+            f"{path}: 'bounds' is not [[x, y, z], [x, y, z]], lowest corner first; write the reel again."
+        )
+    return (a, b, c), (d, e, f)
+
+
+def _is_int(value: Any) -> bool:
+    return isinstance(value, int) and not isinstance(value, bool) and abs(value) < 2**31
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < 1e300
+
+
+def _is_safe(value: Any) -> bool:
+    """Whether `value` is a path that cannot leave the reel's folder, on any system."""
+    if not isinstance(value, str) or not value or "\\" in value or "\0" in value or PureWindowsPath(value).drive:
+        return False
+    relative = PurePosixPath(value)
+    return not relative.is_absolute() and ".." not in relative.parts
