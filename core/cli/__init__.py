@@ -6,7 +6,8 @@ import sys
 
 from ..errors import HoloreelError
 
-# Each module `core/cli/<name>.py` (dashes become underscores) has one function `run`; its arguments are the command line.
+# Each module `core/cli/<name>.py` has one function `run` whose arguments are the command line; where defaults depend on
+# the arguments themselves, `prepare(arguments)` returns that function instead.
 COMMANDS = {
     "synth": "render a multi-view capture from a Blender scene",
     "train": "train a reel from a capture",
@@ -38,7 +39,8 @@ def main(arguments: list[str] | None = None) -> int:
 
     module = importlib.import_module(f".{name.replace('-', '_')}", __name__)
     try:
-        tyro.cli(module.run, prog=f"holoreel {name}", args=rest)
+        command = module.prepare(rest) if hasattr(module, "prepare") else module.run
+        tyro.cli(command, prog=f"holoreel {name}", args=rest)
     except HoloreelError as error:
         print(f"holoreel {name}: {error}", file=sys.stderr)
         return 2

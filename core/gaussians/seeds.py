@@ -1,0 +1,100 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The first Gaussians of a run, from the capture's points of all frames (Spacetime Gaussians, Sec. 5)."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .config import TrainConfig
+from .model import SpacetimeGaussians
+
+# A voxel this many point spacings wide almost surely holds a point of every frame in which its surface is there.
+STATIC_VOXEL = 2.5
+STATIC_SHARE = 0.8
+
+
+def neighbor_distances(points: NDArray[np.float32], count: int = 3) -> NDArray[np.float32]:
+    """Return the root mean square distance of each of (N, 3) points to its `count` nearest others, (N,)."""
+    from scipy.spatial import cKDTree
+
+    count = min(count, len(points) - 1)
+    if count < 1:
+        return np.full(len(points), 1e-3, np.float32)
+    distances = cKDTree(points).query(points, k=count + 1, workers=-1)[0][:, 1:]
+    return np.sqrt(np.mean(distances**2, axis=1)).astype(np.float32)
+
+
+def voxel_ids(points: NDArray[np.float32], size: float) -> NDArray[np.int64]:
+    """Return for each of (N, 3) points a number that it shares with exactly the points of its voxel."""
+    cells = np.floor(points.astype(np.float64) / size).astype(np.int64)
+    return np.unique(cells, axis=0, return_inverse=True)[1].reshape(-1)
+
+
+def first_of_each(ids: NDArray[np.int64], order: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Return the positions of the first element of each id, met in the given `order`."""
+    return order[np.unique(ids[order], return_index=True)[1]]
+
+
+def split_static(
+    points: NDArray[np.float32], frames: NDArray[np.int64], frame_count: int, spacing: float
+) -> NDArray[np.bool_]:
+    """Return which points lie where nearly all frames have points: what stands still, (N,)."""
+    voxels = voxel_ids(points, STATIC_VOXEL * spacing)
+    occupied = np.unique(np.stack([voxels, frames], axis=1), axis=0)[:, 0]
+    return np.bincount(occupied, minlength=voxels.max() + 1)[voxels] >= STATIC_SHARE * frame_count
+
+
+def gaussians_from_points(
+    points: Sequence[tuple[NDArray[np.float32], NDArray[np.uint8]]], config: TrainConfig, rng: np.random.Generator
+) -> SpacetimeGaussians:
+    """Make lite Spacetime Gaussians from one (xyz (N, 3), rgb (N, 3) uint8) pair per frame of a segment.
+
+    Points that nearly every frame has in the same place become one long-lived Gaussian; the others become short-lived
+    ones centered at their frame. Sizes follow the distance to the nearest neighbors.
+    """
+    frame_count = len(points)
+    xyz = np.concatenate([p for p, _ in points]).astype(np.float32)
+    rgb = np.concatenate([c for _, c in points]).astype(np.float32) / 255.0
+    frames = np.repeat(np.arange(frame_count), [len(p) for p, _ in points])
+    first = points[0][0]
+    sample = first[rng.permutation(len(first))[:20_000]]
+    # The spacing of the sample is that of the whole, widened as the square root of how much was left out (a surface).
+    spacing = float(np.median(neighbor_distances(sample))) * np.sqrt(len(sample) / max(len(first), 1))
+
+    static = split_static(xyz, frames, frame_count, spacing) if frame_count > 1 else np.ones(len(xyz), dtype=bool)
+    order = rng.permutation(len(xyz))
+    kept = _thin(xyz, order[static[order]], spacing, config.max_seeds * 2 // 3)
+    moving = order[~static[order]]
+    kept = np.concatenate([kept, moving[: max(config.max_seeds - len(kept), 0)]])
+
+    xyz, rgb, frames, static = xyz[kept], rgb[kept], frames[kept], static[kept]
+    scales = np.empty(len(kept), np.float32)
+    scales[static] = neighbor_distances(xyz[static]) if static.any() else 0
+    # Neighbors of a moving point are those of its own frame: the others are where it was, not how dense it is.
+    for frame in np.unique(frames[~static]):
+        rows = ~static & (frames == frame)
+        scales[rows] = neighbor_distances(xyz[rows])
+    scales = np.clip(scales, 0.1 * spacing, 10.0 * spacing)
+    count = len(kept)
+    return SpacetimeGaussians(
+        means=xyz,
+        motions=np.zeros((count, 3, 3), np.float32),
+        quats=np.tile(np.array([1, 0, 0, 0], np.float32), (count, 1)),
+        omegas=np.zeros((count, 4), np.float32),
+        log_scales=np.repeat(np.log(scales)[:, None], 3, axis=1).astype(np.float32),
+        opacity_logits=np.full(count, np.log(config.seed_opacity / (1 - config.seed_opacity)), np.float32),
+        features=rgb,
+        trbf_centers=np.where(static, 0.5, frames / frame_count).astype(np.float32),
+        trbf_log_scales=np.log(np.where(static, config.static_width, config.moving_width)).astype(np.float32),
+    )
+
+
+def _thin(xyz: NDArray[np.float32], rows: NDArray[np.int64], spacing: float, limit: int) -> NDArray[np.int64]:
+    """Keep one of `rows` per voxel, with voxels as small as `limit` allows."""
+    size = spacing * 0.5
+    while True:
+        kept = rows[first_of_each(voxel_ids(xyz[rows], size), np.arange(len(rows)))] if len(rows) else rows
+        if len(kept) <= limit:
+            return kept
+        size *= 1.15
