@@ -1,0 +1,330 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Small tools the sample scenes are built with: shapes, paints, motions, light and camera.
+
+Runs inside Blender (bpy 4.5 or 5.x). Lengths are meters, angles radians unless a name says otherwise, Z is up, colors are
+sRGB hex strings. Motion is closed-form drivers in `frame` (Blender evaluates these without running Python, so they also play
+where auto-execution is off) and plain keyframes: nothing to bake, no caches, exact at sub-frames.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Sequence
+from pathlib import Path
+
+import bpy
+import numpy as np
+
+Point = tuple[float, float, float]
+Outline = Sequence[tuple[float, float]]
+
+TARGET_NAME = "Holoreel Target"
+
+
+def linear_rgb(color: str) -> tuple[float, float, float]:
+    """Scene-linear RGB of an sRGB hex color such as "#e2614a" (IEC 61966-2-1)."""
+    srgb = [int(color[i : i + 2], 16) / 255 for i in (1, 3, 5)]
+    red, green, blue = (c / 12.92 if c <= 0.04045 else ((c + 0.055) / 1.055) ** 2.4 for c in srgb)
+    return red, green, blue
+
+
+# ---------------------------------------------------------------------------------------------------------------- paints
+
+
+def paint(name: str, color: str, *, roughness: float = 0.8, grain: float = 0.1, scale: float = 6.0) -> bpy.types.Material:
+    """A Principled material whose color wanders by ±`grain` (relative) over blotches about 1/`scale` m wide."""
+    material = bpy.data.materials.new(name)
+    material.use_nodes = True
+    tree = material.node_tree
+    shader = tree.nodes["Principled BSDF"]
+    shader.inputs["Roughness"].default_value = roughness
+    shader.inputs["Specular IOR Level"].default_value = 0.5 if roughness < 0.5 else 0.1
+    rgb = linear_rgb(color)
+    material.diffuse_color = (*rgb, 1.0)
+    if grain == 0.0:
+        shader.inputs["Base Color"].default_value = (*rgb, 1.0)
+        return material
+    place = tree.nodes.new("ShaderNodeTexCoord")
+    noise = tree.nodes.new("ShaderNodeTexNoise")
+    noise.inputs["Scale"].default_value = scale
+    noise.inputs["Detail"].default_value = 1.0
+    ramp = tree.nodes.new("ShaderNodeValToRGB")
+    for stop, (position, gain) in zip(
+        ramp.color_ramp.elements, ((0.3, 1.0 - grain), (0.7, 1.0 + grain)), strict=True
+    ):
+        stop.position = position
+        stop.color = (*(c * gain for c in rgb), 1.0)
+    tree.links.new(place.outputs["Object"], noise.inputs["Vector"])
+    tree.links.new(noise.outputs["Factor" if "Factor" in noise.outputs else "Fac"], ramp.inputs["Fac"])
+    tree.links.new(ramp.outputs["Color"], shader.inputs["Base Color"])
+    return material
+
+
+def mural(name: str, srgb: np.ndarray, *, roughness: float = 0.9) -> bpy.types.Material:
+    """A material showing a picture, (H, W, 3) sRGB in [0, 1], top row first, packed into the .blend and laid out by UV."""
+    height, width, _ = srgb.shape
+    image = bpy.data.images.new(name, width, height)
+    rgba = np.ones((height, width, 4), np.float32)
+    rgba[..., :3] = np.clip(srgb[::-1], 0, 1)
+    image.pixels.foreach_set(rgba.ravel())
+    image.update()
+    image.pack()
+    material = bpy.data.materials.new(name)
+    material.use_nodes = True
+    tree = material.node_tree
+    shader = tree.nodes["Principled BSDF"]
+    shader.inputs["Roughness"].default_value = roughness
+    shader.inputs["Specular IOR Level"].default_value = 0.0
+    texture = tree.nodes.new("ShaderNodeTexImage")
+    texture.image = image
+    texture.extension = "EXTEND"
+    tree.links.new(texture.outputs["Color"], shader.inputs["Base Color"])
+    return material
+
+
+def glow(name: str, color: str, strength: float) -> bpy.types.Material:
+    """A lamp to look at; it is left out of light sampling, so it adds no noise."""
+    material = paint(name, color, grain=0.0)
+    shader = material.node_tree.nodes["Principled BSDF"]
+    shader.inputs["Emission Color"].default_value = (*linear_rgb(color), 1.0)
+    shader.inputs["Emission Strength"].default_value = strength
+    material.cycles.emission_sampling = "NONE"
+    return material
+
+
+# ---------------------------------------------------------------------------------------------------------------- shapes
+
+
+def add_mesh(
+    name: str,
+    vertices: Iterable[Point] | np.ndarray,
+    faces: Iterable[Sequence[int]],
+    materials: Sequence[bpy.types.Material],
+    *,
+    slots: Sequence[int] | None = None,
+    smooth: bool = False,
+    bevel: float = 0.0,
+    at: Point = (0.0, 0.0, 0.0),
+    parent: bpy.types.Object | None = None,
+) -> bpy.types.Object:
+    """A mesh object in the scene; `slots` gives each face its material, `bevel` rounds its sharp edges (meters)."""
+    mesh = bpy.data.meshes.new(name)
+    mesh.from_pydata([tuple(map(float, v)) for v in vertices], [], [tuple(map(int, f)) for f in faces])
+    for material in materials:
+        mesh.materials.append(material)
+    if slots is not None:
+        mesh.polygons.foreach_set("material_index", np.asarray(slots, np.int32))
+    mesh.polygons.foreach_set("use_smooth", np.full(len(mesh.polygons), smooth))
+    thing = link(bpy.data.objects.new(name, mesh), at=at, parent=parent)
+    if bevel:
+        modifier = thing.modifiers.new("Soft edges", "BEVEL")
+        modifier.width = bevel
+        modifier.segments = 2
+        modifier.limit_method = "ANGLE"
+    return thing
+
+
+def link(thing: bpy.types.Object, *, at: Point = (0, 0, 0), parent: bpy.types.Object | None = None) -> bpy.types.Object:
+    """Put an object into the scene at a place (in its parent's space, if it has one)."""
+    bpy.context.scene.collection.objects.link(thing)
+    thing.location = at
+    thing.parent = parent
+    return thing
+
+
+def empty(name: str, at: Point = (0, 0, 0), parent: bpy.types.Object | None = None) -> bpy.types.Object:
+    """A handle that things hang on."""
+    thing = link(bpy.data.objects.new(name, None), at=at, parent=parent)
+    thing.empty_display_size = 0.15
+    return thing
+
+
+def slab(
+    name: str, outline: Outline, thickness: float, material: bpy.types.Material, *, upright: bool = False, **options
+) -> bpy.types.Object:
+    """A plate cut along a closed outline (counter-clockwise): lying on z = 0, or `upright`, facing -Y and centered on it."""
+    count = len(outline)
+    flat = np.asarray(outline, float)
+    low, high = (np.full(count, h) for h in ((-thickness / 2, thickness / 2) if upright else (0.0, thickness)))
+    if upright:
+        front, back = np.c_[flat[:, 0], low, flat[:, 1]], np.c_[flat[:, 0], high, flat[:, 1]]
+        vertices, caps = np.r_[back, front], [list(range(count))[::-1], list(range(count, 2 * count))]
+    else:
+        vertices = np.r_[np.c_[flat, low], np.c_[flat, high]]
+        caps = [list(range(count))[::-1], list(range(count, 2 * count))]
+    sides = [(i, (i + 1) % count, count + (i + 1) % count, count + i) for i in range(count)]
+    return add_mesh(name, vertices, caps + sides, [material], **options)
+
+
+def lathe(
+    name: str,
+    profile: Outline,
+    materials: Sequence[bpy.types.Material],
+    *,
+    segments: int = 32,
+    slot: Callable[[int, int], int] = lambda ring, segment: 0,
+    squash: tuple[float, float] = (1.0, 1.0),
+    smooth: bool = True,
+    **options,
+) -> bpy.types.Object:
+    """Turn a profile of (radius, z), bottom to top, about Z; `slot(ring, segment)` picks each face's material."""
+    angle = np.linspace(0, 2 * np.pi, segments, endpoint=False)
+    vertices = [
+        (radius * squash[0] * math.cos(a), radius * squash[1] * math.sin(a), z) for radius, z in profile for a in angle
+    ]
+    faces, slots = [], []
+    for ring in range(len(profile) - 1):
+        for i in range(segments):
+            j = (i + 1) % segments
+            faces.append((ring * segments + i, ring * segments + j, (ring + 1) * segments + j, (ring + 1) * segments + i))
+            slots.append(slot(ring, i))
+    last = (len(profile) - 1) * segments
+    faces += [tuple(range(segments))[::-1], tuple(range(last, last + segments))]
+    slots += [slot(0, 0), slot(len(profile) - 2, 0)]
+    return add_mesh(name, vertices, faces, materials, slots=slots, smooth=smooth, **options)
+
+
+def ball_profile(radius: float, rings: int = 16, *, low: float = -1.0, high: float = 1.0) -> list[tuple[float, float]]:
+    """Profile of a ball about the origin between the heights `low` and `high` (in radii)."""
+    angles = np.linspace(math.asin(max(low, -0.9999)), math.asin(min(high, 0.9999)), rings)
+    return [(radius * math.cos(a), radius * math.sin(a)) for a in angles]
+
+
+def ball(name: str, radius: float, material: bpy.types.Material, *, stretch: float = 1.0, **options) -> bpy.types.Object:
+    """A ball, stretched along Z."""
+    profile = [(r, z * stretch) for r, z in ball_profile(radius, options.pop("rings", 14))]
+    return lathe(name, profile, [material], segments=options.pop("segments", 24), **options)
+
+
+def box(name: str, size: Point, material: bpy.types.Material, **options) -> bpy.types.Object:
+    """A box standing on its origin."""
+    x, y, z = size[0] / 2, size[1] / 2, size[2]
+    return slab(name, [(-x, -y), (x, -y), (x, y), (-x, y)], z, material, **options)
+
+
+def blob(radius: float, wobble: Sequence[tuple[int, float, float]], count: int = 64) -> list[tuple[float, float]]:
+    """A round outline with a few harmonics (order, relative size, phase)."""
+    angle = np.linspace(0, 2 * np.pi, count, endpoint=False)
+    r = radius * (1 + sum(size * np.cos(order * angle + phase) for order, size, phase in wobble))
+    return list(zip(r * np.cos(angle), r * np.sin(angle), strict=True))
+
+
+def strip(
+    name: str, rows: np.ndarray, materials: Sequence[bpy.types.Material], *, row_slots: Sequence[int] = (), **options
+) -> bpy.types.Object:
+    """A sheet through rows of points, (rows, columns, 3), with UVs: u along the columns, v along the rows."""
+    count, columns, _ = rows.shape
+    index = np.arange(count * columns).reshape(count, columns)
+    faces = np.stack([index[:-1, :-1], index[:-1, 1:], index[1:, 1:], index[1:, :-1]], -1).reshape(-1, 4)
+    slots = np.repeat(row_slots, columns - 1) if len(row_slots) else np.zeros(len(faces), int)
+    thing = add_mesh(name, rows.reshape(-1, 3), faces, materials, slots=slots, **options)
+    u, v = np.meshgrid(np.linspace(0, 1, columns), np.linspace(0, 1, count))
+    layer = thing.data.uv_layers.new(name="UVMap")
+    layer.uv.foreach_set("vector", np.stack([u, v], -1).reshape(-1, 2)[faces.ravel()].astype(np.float32).ravel())
+    return thing
+
+
+# --------------------------------------------------------------------------------------------------------------- motions
+
+
+def drive(owner: bpy.types.ID | bpy.types.ShapeKey, path: str, expression: str, index: int = -1) -> None:
+    """Let a property follow an expression in `frame`."""
+    curve = owner.driver_add(path, index)
+    curve.driver.type = "SCRIPTED"
+    curve.driver.expression = expression
+
+
+def turn(period: float, phase: float = 0.0) -> str:
+    """Driver text: an angle that makes one turn in `period` frames, `phase` radians at frame 0."""
+    return f"(frame*{2 * math.pi / period:.9f}+{phase:.6f})"
+
+
+def wave_keys(thing: bpy.types.Object, sine: np.ndarray, cosine: np.ndarray, period: float, phase: float = 0.0) -> None:
+    """Deform a mesh by `sine`·sin + `cosine`·cos of time, offsets (vertices, 3): a traveling wave from two shape keys."""
+    rest = np.array([v.co for v in thing.data.vertices])
+    thing.shape_key_add(name="Rest")
+    for name, offset, function in (("Sine", sine, "sin"), ("Cosine", cosine, "cos")):
+        key = thing.shape_key_add(name=name)
+        key.data.foreach_set("co", (rest + offset).astype(np.float32).ravel())
+        key.slider_min = -1.0
+        drive(key, "value", f"{function}{turn(period, phase)}")
+
+
+def pop(thing: bpy.types.Object, scales: Sequence[tuple[int, float]]) -> None:
+    """Key a uniform scale at frames; a size of 0 also takes the thing out of the render."""
+    for frame, size in scales:
+        thing.scale = (max(size, 0.001),) * 3
+        thing.keyframe_insert("scale", frame=frame)
+        thing.hide_render = thing.hide_viewport = size == 0.0
+        thing.keyframe_insert("hide_render", frame=frame)
+        thing.keyframe_insert("hide_viewport", frame=frame)
+
+
+# ------------------------------------------------------------------------------------------------------- light and camera
+
+
+def start(frames: int = 48) -> bpy.types.Scene:
+    """An empty scene with the look all sample scenes share: Cycles, few bounces, Standard view transform."""
+    bpy.ops.wm.read_factory_settings(use_empty=True)
+    scene = bpy.context.scene
+    scene.frame_start, scene.frame_end = 1, frames
+    render = scene.render
+    render.engine = "CYCLES"
+    render.resolution_x, render.resolution_y, render.fps = 1280, 720, 24
+    scene.view_settings.view_transform = "Standard"
+    scene.view_settings.look = "None"
+    cycles = scene.cycles
+    cycles.samples = 96
+    cycles.use_denoising = True
+    cycles.max_bounces, cycles.diffuse_bounces, cycles.glossy_bounces = 3, 2, 1
+    cycles.transmission_bounces = cycles.volume_bounces = cycles.transparent_max_bounces = 0
+    cycles.caustics_reflective = cycles.caustics_refractive = False
+    return scene
+
+
+def sky(scene: bpy.types.Scene, low: str, high: str, strength: float) -> None:
+    """Soft light from all around: one color at the horizon, another overhead."""
+    world = bpy.data.worlds.new("Soft sky")
+    scene.world = world
+    world.use_nodes = True
+    tree = world.node_tree
+    place = tree.nodes.new("ShaderNodeTexCoord")
+    split = tree.nodes.new("ShaderNodeSeparateXYZ")
+    ramp = tree.nodes.new("ShaderNodeValToRGB")
+    for stop, color in zip(ramp.color_ramp.elements, (low, high), strict=True):
+        stop.color = (*linear_rgb(color), 1.0)
+    tree.links.new(place.outputs["Generated"], split.inputs["Vector"])
+    tree.links.new(split.outputs["Z"], ramp.inputs["Fac"])
+    background = tree.nodes["Background"]
+    background.inputs["Strength"].default_value = strength
+    tree.links.new(ramp.outputs["Color"], background.inputs["Color"])
+
+
+def sun(color: str, strength: float, elevation_deg: float, azimuth_deg: float, size_deg: float) -> bpy.types.Object:
+    """A sun `size_deg` wide; azimuth 0 is behind the front camera, positive to its right."""
+    data = bpy.data.lights.new("Sun", "SUN")
+    data.color, data.energy, data.angle = linear_rgb(color), strength, math.radians(size_deg)
+    light = link(bpy.data.objects.new("Sun", data), at=(-2.0, -3.0, 4.0))
+    light.rotation_euler = (math.radians(90 - elevation_deg), 0.0, math.radians(azimuth_deg))
+    return light
+
+
+def camera(scene: bpy.types.Scene, target: Point, distance: float, down_deg: float, lens: float) -> bpy.types.Object:
+    """The front camera, looking at the target from -Y, and the empty that camera rigs aim at."""
+    aim = empty(TARGET_NAME, target)
+    data = bpy.data.cameras.new("Camera")
+    data.lens = lens
+    down = math.radians(down_deg)
+    eye = (target[0], target[1] - distance * math.cos(down), target[2] + distance * math.sin(down))
+    view = link(bpy.data.objects.new("Camera", data), at=eye)
+    view.rotation_euler = (math.pi / 2 - down, 0.0, 0.0)
+    data.dof.focus_object = aim
+    scene.camera = view
+    return view
+
+
+def save(path: Path) -> None:
+    """Write the open scene, compressed and without anything that lies outside the file."""
+    bpy.ops.outliner.orphans_purge(do_recursive=True)
+    bpy.context.preferences.filepaths.save_version = 0
+    bpy.ops.wm.save_as_mainfile(filepath=str(path), compress=True, relative_remap=True)
