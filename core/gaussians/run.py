@@ -13,10 +13,8 @@ import torch
 from ..capture import Capture
 from ..errors import HoloreelError
 from ..files import atomic_path, write_json
-from ..reel import Reel, Segment, write_reel
+from ..reel import save_gaussians
 from .config import TrainConfig
-from .model import SpacetimeGaussians
-from .ply import write_ply
 from .train import Progress, Trainer
 
 
@@ -25,11 +23,6 @@ class RunPaths:
     """The files of a run, all beside the reel and named after it."""
 
     reel: Path
-
-    @property
-    def gaussians(self) -> Path:
-        """The payload: the authors' PLY."""
-        return self.reel.with_suffix(".ply")
 
     @property
     def checkpoint(self) -> Path:
@@ -127,29 +120,27 @@ def _plain(value: object) -> object:
 
 
 def _write_result(trainer: Trainer, paths: RunPaths) -> None:
-    gaussians, capture = trainer.gaussians(), trainer.capture
-    write_ply(paths.gaussians, gaussians)
     write_json(paths.record, _record(trainer))
-    write_reel(paths.reel, make_reel(gaussians, capture, paths))
-
-
-def make_reel(gaussians: SpacetimeGaussians, capture: Capture, paths: RunPaths) -> Reel:
-    """Describe one segment of Gaussians as a reel with the capture's timing."""
-    low, high = gaussians.bounds()
-    return Reel(
-        variant="lite",
-        fps=capture.fps,
-        frame_start=capture.frame_start,
-        frame_count=capture.frame_count,
-        bounds=(tuple(map(float, low)), tuple(map(float, high))),
-        segments=(Segment(paths.gaussians.name, capture.frame_start, capture.frame_count),),
+    save_gaussians(
+        paths.reel,
+        trainer.gaussians(),
+        fps=trainer.capture.fps,
+        frame_start=trainer.capture.frame_start,
+        frame_count=trainer.capture.frame_count,
+        up="Z",
+        files={"config": paths.record.name},
+        provenance={"capture": _capture_name(trainer), "iterations": trainer.iteration},
     )
+
+
+def _capture_name(trainer: Trainer) -> str | None:
+    return trainer.capture.root.name if trainer.capture.root else None
 
 
 def _record(trainer: Trainer) -> dict[str, object]:
     return {
         "config": asdict(trainer.config),
-        "capture": trainer.capture.root.name if trainer.capture.root else None,
+        "capture": _capture_name(trainer),
         "train_cameras": trainer.names,
         "gaussians": len(trainer.parameters),
         "seconds": round(trainer.seconds, 2),

@@ -28,7 +28,10 @@ def neighbor_distances(points: NDArray[np.float32], count: int = 3) -> NDArray[n
 def voxel_ids(points: NDArray[np.float32], size: float) -> NDArray[np.int64]:
     """Return for each of (N, 3) points a number that it shares with exactly the points of its voxel."""
     cells = np.floor(points.astype(np.float64) / size).astype(np.int64)
-    return np.unique(cells, axis=0, return_inverse=True)[1].reshape(-1)
+    # Three of these fit into one int64; what lies farther out than a million voxels is a stray point.
+    cells = np.clip(cells - np.median(cells, axis=0).astype(np.int64), -(2**19), 2**19)
+    cells -= cells.min(axis=0)
+    return np.unique(np.ravel_multi_index(tuple(cells.T), cells.max(axis=0) + 1), return_inverse=True)[1]
 
 
 def first_of_each(ids: NDArray[np.int64], order: NDArray[np.int64]) -> NDArray[np.int64]:
@@ -41,7 +44,7 @@ def split_static(
 ) -> NDArray[np.bool_]:
     """Return which points lie where nearly all frames have points: what stands still, (N,)."""
     voxels = voxel_ids(points, STATIC_VOXEL * spacing)
-    occupied = np.unique(np.stack([voxels, frames], axis=1), axis=0)[:, 0]
+    occupied = np.unique(voxels * frame_count + frames) // frame_count
     return np.bincount(occupied, minlength=voxels.max() + 1)[voxels] >= STATIC_SHARE * frame_count
 
 
