@@ -90,21 +90,9 @@ class Camera:
 
     def _rigid(self) -> Array:
         try:
-            matrix = np.array(self.world_to_camera, dtype=np.float64)
-        except (TypeError, ValueError) as error:
-            raise self._error("world_to_camera", "must be 4 rows of 4 numbers") from error
-        if matrix.shape != (4, 4):
-            raise self._error("world_to_camera", f"must be 4 rows of 4 numbers, not of shape {matrix.shape}")
-        if not np.isfinite(matrix).all():
-            raise self._error("world_to_camera", "holds NaN or infinity")
-        rotation = matrix[:3, :3]
-        offset = float(np.abs(rotation.T @ rotation - np.eye(3)).max())
-        if offset > RIGID_TOLERANCE or np.linalg.det(rotation) < 0 or np.abs(matrix[3] - (0, 0, 0, 1)).max() > 1e-6:
-            raise self._error("world_to_camera", "must be a rotation and a translation (no scale, shear or mirroring)")
-        if offset > 1e-12:
-            left, _, right = np.linalg.svd(rotation)
-            matrix[:3, :3] = left @ right
-        matrix[3] = (0, 0, 0, 1)
+            matrix = rigid(self.world_to_camera)
+        except ValueError as error:
+            raise self._error("world_to_camera", str(error)) from error
         matrix.flags.writeable = False
         return matrix
 
@@ -225,6 +213,27 @@ def focal_from_fov(fov_degrees: float, pixels: int) -> float:
     if not 0 < fov_degrees < 180:
         raise HoloreelError(f"a field of view must lie between 0 and 180 degrees, not {fov_degrees:g}.")
     return pixels / 2 / math.tan(math.radians(fov_degrees) / 2)
+
+
+def rigid(matrix: ArrayLike) -> Array:
+    """Return `matrix` as a 4 × 4 rotation and translation, rounding removed; a ValueError says what it is instead."""
+    try:
+        result = np.array(matrix, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise ValueError("must be 4 rows of 4 numbers") from error
+    if result.shape != (4, 4):
+        raise ValueError(f"must be 4 rows of 4 numbers, not of shape {result.shape}")
+    if not np.isfinite(result).all():
+        raise ValueError("holds NaN or infinity")
+    rotation = result[:3, :3]
+    offset = float(np.abs(rotation.T @ rotation - np.eye(3)).max())
+    if offset > RIGID_TOLERANCE or np.linalg.det(rotation) < 0 or np.abs(result[3] - (0, 0, 0, 1)).max() > 1e-6:
+        raise ValueError("must be a rotation and a translation (no scale, shear or mirroring)")
+    if offset > 1e-12:
+        left, _, right = np.linalg.svd(rotation)
+        result[:3, :3] = left @ right
+    result[3] = (0, 0, 0, 1)
+    return result
 
 
 def invert_rigid(matrix: Array) -> Array:

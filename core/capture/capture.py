@@ -1,2 +1,111 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """A multi-view recording in memory: who looked, when, and where the pictures lie. Pictures are read one at a time."""
+
+import math
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..camera import Camera
+from ..errors import HoloreelError
+from .images import composite, read_depth, read_picture
+from .points import Points, read_points
+
+View = tuple[str, int]  # camera name, frame index from 0
+
+SPLITS = ("train", "test")
+MAX_FRAMES = 1_000_000
+
+
+@dataclass(frozen=True, eq=False)
+class Capture:
+    """Cameras, frames and the files that belong to each pair of them.
+
+    Frames are counted from 0; frame j of `frame_count` happens at the normalized time j / frame_count and is number
+    `frame_start + j` on the timeline. Not every camera needs a picture of every frame. Nothing is read before it is
+    asked for. Raises `HoloreelError` where the parts contradict each other.
+    """
+
+    cameras: dict[str, Camera]  # by name, in order
+    images: dict[View, Path]
+    frame_count: int = 1
+    splits: dict[str, str] = field(default_factory=dict)  # by camera name; "train" where it says nothing
+    fps: float = 30.0
+    frame_start: int = 1
+    depths: dict[View, Path] = field(default_factory=dict)  # EXR, planar z in scene units
+    seeds: dict[int, Path] = field(default_factory=dict)  # PLY of colored points, by frame index
+    source: Path = Path("capture")  # the file it was read from, for messages
+
+    def __post_init__(self) -> None:
+        problem = self._problem()
+        if problem:
+            raise HoloreelError(f"{self.source}: {problem}.")
+
+    def _problem(self) -> str:
+        if not self.cameras:
+            return "there are no cameras; a capture needs at least one"
+        if not 1 <= self.frame_count <= MAX_FRAMES:
+            return f"frame_count must be 1 to {MAX_FRAMES}, not {self.frame_count}"
+        if not (math.isfinite(self.fps) and self.fps > 0):
+            return f"fps must be positive, not {self.fps}"
+        for name, split in self.splits.items():
+            if name not in self.cameras or split not in SPLITS:
+                return f"the split {split!r} of camera {name!r} is not possible; it is one of {', '.join(SPLITS)}"
+        for name, frame in (*self.images, *self.depths):
+            if name not in self.cameras or not 0 <= frame < self.frame_count:
+                return f"there is a picture of camera {name!r} at frame {frame}, which the capture does not have"
+        if wrong := [frame for frame in self.seeds if not 0 <= frame < self.frame_count]:
+            return f"there are seed points of frame {wrong[0]}, which the capture does not have"
+        return ""
+
+    @property
+    def times(self) -> NDArray[np.float64]:
+        """Normalized times of all frames, (frame_count,), in [0, 1)."""
+        return np.arange(self.frame_count) / self.frame_count
+
+    def time(self, frame: int) -> float:
+        """The normalized time of one frame."""
+        return frame / self.frame_count
+
+    def split(self, name: str) -> str:
+        """The split of a camera: "train" or "test"."""
+        return self.splits.get(name, "train")
+
+    def camera_names(self, split: str | None = None) -> list[str]:
+        """The names of the cameras of a split (of all without one), in order."""
+        return [name for name in self.cameras if split in (None, self.split(name))]
+
+    def views(self, split: str | None = None) -> list[View]:
+        """All (camera name, frame) that have a picture, frame by frame."""
+        names = self.camera_names(split)
+        return [(name, frame) for frame in range(self.frame_count) for name in names if (name, frame) in self.images]
+
+    def image(self, name: str, frame: int, background: tuple[float, float, float] | None = None) -> NDArray[np.uint8]:
+        """Read one picture: (H, W, 3), or (H, W, 4) with straight alpha where the file has alpha.
+
+        With a `background` color (0 to 1) the picture is laid over it and is always (H, W, 3).
+        """
+        camera = self.cameras[name]
+        picture = read_picture(self.images[name, frame], camera.width, camera.height)
+        return picture if background is None else composite(picture, background)
+
+    def depth(self, name: str, frame: int) -> NDArray[np.float32]:
+        """Read one depth map: (H, W) planar z in scene units, infinity where nothing was hit."""
+        camera = self.cameras[name]
+        return read_depth(self.depths[name, frame], camera.width, camera.height)
+
+    def seed_points(self, frame: int) -> Points:
+        """Read the seed points of one frame; none where the capture has no file for it."""
+        if frame in self.seeds:
+            return read_points(self.seeds[frame])
+        return Points(np.empty((0, 3), np.float32), np.empty((0, 3), np.uint8))
+
+    def check_files(self) -> None:
+        """Raise `HoloreelError` naming the first file that is missing, and how many more are."""
+        paths = dict.fromkeys((*self.images.values(), *self.depths.values(), *self.seeds.values()))
+        missing = [path for path in paths if not path.is_file()]
+        if missing:
+            more = f" and {len(missing) - 1} more files" if len(missing) > 1 else ""
+            raise HoloreelError(f"{self.source}: {missing[0]}{more} missing; fetch or render the capture again.")

@@ -1,0 +1,62 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Reading one picture or one depth map of a capture. The libraries are imported when the first one is read."""
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import HoloreelError
+
+BACKGROUND_DEPTH = 1e9  # Cycles writes 1e10 where nothing was hit
+
+
+def read_picture(path: Path, width: int, height: int) -> NDArray[np.uint8]:
+    """Read a picture as (height, width, 3), or (height, width, 4) with straight alpha where it has alpha."""
+    import imageio.v3 as imageio
+
+    try:
+        picture = np.asarray(imageio.imread(path))
+    except (OSError, ValueError, SyntaxError) as error:  # Pillow says SyntaxError for a broken PNG
+        raise HoloreelError(f"{path} cannot be read as a picture ({error}): render or fetch it again.") from error
+    if picture.dtype == np.uint16:
+        picture = ((picture.astype(np.uint32) * 255 + 32767) // 65535).astype(np.uint8)
+    if picture.ndim == 2:
+        picture = np.repeat(picture[..., None], 3, axis=2)
+    if picture.dtype != np.uint8 or picture.ndim != 3 or picture.shape[2] not in (3, 4):
+        raise HoloreelError(f"{path} is no 8- or 16-bit RGB(A) picture: convert it to PNG.")
+    _check_size(path, picture.shape, width, height)
+    return picture
+
+
+def composite(picture: NDArray[np.uint8], background: tuple[float, float, float]) -> NDArray[np.uint8]:
+    """Lay a picture over a `background` color (0 to 1), in display-referred values; (H, W, 3)."""
+    if picture.shape[2] == 3:
+        return picture
+    alpha = picture[..., 3:].astype(np.float32) / 255
+    blend = picture[..., :3] * alpha + np.float32(255) * np.asarray(background, np.float32) * (1 - alpha)
+    return np.clip(blend + 0.5, 0, 255).astype(np.uint8)
+
+
+def read_depth(path: Path, width: int, height: int) -> NDArray[np.float32]:
+    """Read a depth EXR of one channel as (height, width) planar z in scene units; infinity where nothing was hit."""
+    import OpenEXR
+
+    try:
+        with OpenEXR.File(str(path), separate_channels=True) as file:
+            channels = [channel.pixels for part in file.parts for channel in part.channels.values()]
+    except (OSError, RuntimeError, ValueError, TypeError) as error:
+        raise HoloreelError(f"{path} cannot be read as an EXR ({error}): render it again.") from error
+    if not channels:
+        raise HoloreelError(f"{path} has no channel: render it again.")
+    depth = np.array(channels[0], dtype=np.float32)
+    _check_size(path, depth.shape, width, height)
+    depth[~(depth < BACKGROUND_DEPTH)] = np.inf
+    return depth
+
+
+def _check_size(path: Path, shape: tuple[int, ...], width: int, height: int) -> None:
+    if shape[:2] != (height, width):
+        raise HoloreelError(
+            f"{path} is {shape[1]}x{shape[0]}, its camera says {width}x{height}: correct w and h, or the picture."
+        )

@@ -1,0 +1,323 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Captures as nerfstudio's transforms.json, the canonical form on disk.
+
+Format: https://docs.nerf.studio/quickstart/data_conventions.html. Camera-to-world matrices have OpenGL axes (x right,
+y up, looking along -z). Every frame entry has a `time` in [0, 1), as D-NeRF's. What nerfstudio has no word for lies in
+objects named `holoreel`: at the top (version, fps, frame_start, frame_count, cameras, seeds) and in each entry (camera,
+frame). Files without them are read too: entries of one pose and lens are one camera, evenly spaced times are frames.
+"""
+
+import math
+import os
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..camera import Camera, invert_rigid, rigid
+from ..errors import HoloreelError
+from ..files import read_json, write_json
+from .capture import MAX_FRAMES, Capture, View
+
+FILE_NAME = "transforms.json"
+_VERSION = 1
+_MAX_ENTRIES = 2_000_000
+_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])  # OpenCV camera axes in OpenGL's, and back
+_PERSPECTIVE = ("PINHOLE", "SIMPLE_PINHOLE", "OPENCV", "SIMPLE_RADIAL", "RADIAL")
+_DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
+_LENS = {"width": "w", "height": "h", "fx": "fl_x", "fy": "fl_y", "cx": "cx", "cy": "cy"}
+
+
+@dataclass
+class _Entry:
+    """One element of `frames`, understood."""
+
+    path: Path
+    listed: str  # file_path as written
+    camera: Camera
+    time: float | None
+    name: str | None  # camera name, where the file says so
+    frame: int | None
+    depth: Path | None
+
+
+def write_capture(path: str | Path, capture: Capture) -> Path:
+    """Write `capture` as transforms.json (into `path` where that is a folder), atomically; return the file's path.
+
+    Pictures, depth maps and seed points stay where they are and are named relative to the file.
+    """
+    path = _file(path)
+    lenses = {name: _lens(camera) for name, camera in capture.cameras.items()}
+    shared = {key: value for key, value in next(iter(lenses.values())).items() if _same(lenses, key, value)}
+    entries = []
+    files: dict[str, list[str]] = {"train": [], "test": []}
+    for name, frame in capture.views():
+        entry: dict[str, Any] = {"file_path": _relative(capture.images[name, frame], path)}
+        entry |= {key: value for key, value in lenses[name].items() if key not in shared}
+        entry["transform_matrix"] = (capture.cameras[name].camera_to_world @ _OPENGL).tolist()
+        entry["time"] = capture.time(frame)
+        if (name, frame) in capture.depths:
+            entry["depth_file_path"] = _relative(capture.depths[name, frame], path)
+        entry["holoreel"] = {"camera": name, "frame": frame}
+        entries.append(entry)
+        files[capture.split(name)].append(entry["file_path"])
+    value: dict[str, Any] = {"camera_model": "OPENCV", **shared}
+    if files["test"]:
+        value |= {
+            "train_filenames": files["train"],
+            "val_filenames": files["test"],
+            "test_filenames": files["test"],
+        }
+    seeds = [_relative(capture.seeds[j], path) if j in capture.seeds else None for j in range(capture.frame_count)]
+    if any(seeds):
+        value["ply_file_path"] = next(seed for seed in seeds if seed)
+    value["holoreel"] = {
+        "version": _VERSION,
+        "fps": capture.fps,
+        "frame_start": capture.frame_start,
+        "frame_count": capture.frame_count,
+        "cameras": list(capture.cameras),
+        "seeds": seeds if any(seeds) else [],
+    }
+    write_json(path, value | {"frames": entries})
+    return path
+
+
+def read_capture(path: str | Path) -> Capture:
+    """Read a transforms.json (or the one in the folder `path`); raises `HoloreelError` naming file, field and remedy.
+
+    All files it names must exist. Without `time`, every pose is a camera of a capture of one frame.
+    """
+    path = _file(path)
+    meta = read_json(path)
+    extra = meta.get("holoreel")
+    if extra is not None and (not isinstance(extra, dict) or extra.get("version") != _VERSION):
+        raise HoloreelError(f"{path}: holoreel.version must be {_VERSION}; read it with the Holoreel that wrote it.")
+    entries = _entries(path, meta)
+    cameras, names = _cameras(path, entries, extra)
+    frames, frame_count = _frames(path, entries, names, extra)
+    images: dict[View, Path] = {}
+    depths: dict[View, Path] = {}
+    for entry, name, frame in zip(entries, names, frames, strict=True):
+        if (name, frame) in images:
+            raise HoloreelError(
+                f"{path}: {entry.listed} is the second picture of camera {name!r} at one time; take one out."
+            )
+        images[name, frame] = entry.path
+        if entry.depth:
+            depths[name, frame] = entry.depth
+    capture = Capture(
+        cameras=cameras,
+        images=images,
+        frame_count=frame_count,
+        splits=_splits(path, meta, entries, names),
+        fps=_number(path, "holoreel.fps", extra.get("fps")) if extra else 30.0,
+        frame_start=_integer(path, "holoreel.frame_start", extra.get("frame_start")) if extra else 1,
+        depths=depths,
+        seeds=_seeds(path, meta, extra, frame_count),
+        source=path,
+    )
+    capture.check_files()
+    return capture
+
+
+def _file(path: str | Path) -> Path:
+    path = Path(path)
+    return path if path.suffix == ".json" else path / FILE_NAME
+
+
+def _relative(file: Path, transforms: Path) -> str:
+    return Path(os.path.relpath(file, transforms.parent)).as_posix()
+
+
+def _lens(camera: Camera) -> dict[str, float]:
+    if camera.model != "PINHOLE":
+        raise HoloreelError(f"camera {camera.name!r}: model {camera.model} cannot be written to {FILE_NAME} yet.")
+    return {key: getattr(camera, field) for field, key in _LENS.items()}
+
+
+def _same(lenses: dict[str, dict[str, float]], key: str, value: float) -> bool:
+    return all(lens[key] == value for lens in lenses.values())
+
+
+def _entries(path: Path, meta: dict[str, Any]) -> list[_Entry]:
+    frames = meta.get("frames")
+    if not isinstance(frames, list) or not frames or len(frames) > _MAX_ENTRIES:
+        raise HoloreelError(f"{path}: frames must be a list of 1 to {_MAX_ENTRIES} pictures; export it again.")
+    model = meta.get("camera_model", "OPENCV")
+    if model not in _PERSPECTIVE:
+        raise HoloreelError(f"{path}: camera_model {model!r} is not supported; undistort the pictures to OPENCV.")
+    world = _applied_transform(path, meta)
+    return [_entry(path, meta, index, frame, world) for index, frame in enumerate(frames)]
+
+
+def _applied_transform(path: Path, meta: dict[str, Any]) -> NDArray[np.float64]:
+    """Return what takes the file's poses back to the world that its points are in."""
+    if meta.get("applied_scale", 1) != 1:
+        raise HoloreelError(f"{path}: applied_scale must be 1; export the capture without scaling its poses.")
+    if "applied_transform" not in meta:
+        return np.eye(4)
+    try:
+        return invert_rigid(rigid([*meta["applied_transform"], [0, 0, 0, 1]]))
+    except (TypeError, ValueError) as error:
+        raise HoloreelError(f"{path}: applied_transform {error}; export the capture without it.") from error
+
+
+def _entry(path: Path, meta: dict[str, Any], index: int, frame: Any, world: NDArray[np.float64]) -> _Entry:
+    where = f"{path}: frames[{index}]"
+    if not isinstance(frame, dict) or not isinstance(frame.get("file_path"), str):
+        raise HoloreelError(f"{where}.file_path is missing; export the capture again.")
+    if frame.get("camera_model", "OPENCV") not in _PERSPECTIVE:
+        raise HoloreelError(f"{where}.camera_model {frame['camera_model']!r} is not supported; undistort the pictures.")
+    for key in _DISTORTION:
+        if frame.get(key, meta.get(key, 0)) != 0:
+            raise HoloreelError(f"{where}: {key} is not 0; undistort the pictures, lens distortion is not supported.")
+    lens = {field: frame.get(key, meta.get(key)) for field, key in _LENS.items()}
+    if missing := [_LENS[field] for field, value in lens.items() if value is None]:
+        raise HoloreelError(f"{where}: {missing[0]} is missing, there and at the top; export the capture again.")
+    try:
+        pose = world @ rigid(frame.get("transform_matrix")) @ _OPENGL
+    except ValueError as error:
+        raise HoloreelError(f"{where}.transform_matrix {error}; export the capture again.") from error
+    try:
+        camera = Camera(**lens, world_to_camera=invert_rigid(pose))
+    except HoloreelError as error:
+        raise HoloreelError(f"{where}: {error}") from error
+    own = frame.get("holoreel") or {}
+    name, number = (own.get("camera"), own.get("frame")) if isinstance(own, dict) else (None, None)
+    depth = frame.get("depth_file_path")
+    time = frame.get("time")
+    return _Entry(
+        path=_existing(path, frame["file_path"]),
+        listed=frame["file_path"],
+        camera=camera,
+        time=None if time is None else _number(path, f"frames[{index}].time", time),
+        name=name if isinstance(name, str) else None,
+        frame=None if number is None else _integer(path, f"frames[{index}].holoreel.frame", number),
+        depth=_existing(path, depth) if isinstance(depth, str) else None,
+    )
+
+
+def _existing(path: Path, name: str) -> Path:
+    """The file `name` means; NeRF's files leave `.png` out."""
+    file = path.parent / name.replace("\\", "/")
+    png = file.with_name(file.name + ".png")
+    return png if not file.suffix and png.is_file() else file
+
+
+def _number(path: Path, field: str, value: Any) -> float:
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value):
+        raise HoloreelError(f"{path}: {field} must be a finite number, not {value!r}.")
+    return float(value)
+
+
+def _integer(path: Path, field: str, value: Any) -> int:
+    if isinstance(value, bool) or not isinstance(value, int) or abs(value) > 2**31:
+        raise HoloreelError(f"{path}: {field} must be a whole number, not {value!r}.")
+    return value
+
+
+def _cameras(path: Path, entries: list[_Entry], extra: dict[str, Any] | None) -> tuple[dict[str, Camera], list[str]]:
+    """Return the cameras by name, and the camera's name of each entry."""
+    keys = [_pose_key(entry.camera) for entry in entries]
+    if all(entry.name for entry in entries):
+        names = [str(entry.name) for entry in entries]
+    else:
+        named = _names(entries, keys)
+        names = [named[key] for key in keys]
+    first: dict[str, int] = {}
+    for index, name in enumerate(names):
+        if keys[first.setdefault(name, index)] != keys[index]:
+            raise HoloreelError(
+                f"{path}: camera {name!r} has another pose or lens in {entries[index].listed}; "
+                "cameras stand still, so give every pose a name of its own."
+            )
+    order = list(first)
+    if extra and isinstance(extra.get("cameras"), list):
+        order.sort(key=lambda name: (extra["cameras"] + [name]).index(name))
+    return {name: replace(entries[first[name]].camera, name=name) for name in order}, names
+
+
+def _pose_key(camera: Camera) -> tuple[float, ...]:
+    values = [camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy]
+    return (*values, *np.round(camera.world_to_camera[:3].ravel(), 7).tolist())
+
+
+def _names(entries: list[_Entry], keys: list[tuple[float, ...]]) -> dict[tuple[float, ...], str]:
+    """Name each pose after the folder of its pictures, or after its one picture; else by number."""
+    stems: dict[tuple[float, ...], set[str]] = {}
+    folders: dict[tuple[float, ...], set[str]] = {}
+    for entry, key in zip(entries, keys, strict=True):
+        stems.setdefault(key, set()).add(entry.path.stem)
+        folders.setdefault(key, set()).add(entry.path.parent.name)
+    for candidates in (folders, stems):
+        found = [next(iter(values)) for values in candidates.values() if len(values) == 1]
+        if len(set(found)) == len(candidates) and all(found):
+            return dict(zip(candidates, found, strict=True))
+    digits = len(str(len(stems) - 1))
+    return {key: f"cam{index:0{max(digits, 2)}d}" for index, key in enumerate(stems)}
+
+
+def _frames(path: Path, entries: list[_Entry], names: list[str], extra: dict[str, Any] | None) -> tuple[list[int], int]:
+    """Return the frame index of each entry, and the number of frames."""
+    if extra is not None and all(entry.frame is not None for entry in entries):
+        count = _integer(path, "holoreel.frame_count", extra.get("frame_count"))
+        for entry in entries:
+            frame = entry.frame or 0
+            if not 0 <= frame < count <= MAX_FRAMES:
+                raise HoloreelError(f"{path}: frame {frame} of {entry.listed} is outside holoreel.frame_count {count}.")
+            if entry.time is None or abs(entry.time - frame / count) > 1e-6:
+                raise HoloreelError(
+                    f"{path}: time of {entry.listed} must be {frame}/{count}, not {entry.time}; correct one of them."
+                )
+        return [entry.frame or 0 for entry in entries], count
+    untimed = [entry for entry in entries if entry.time is None]
+    if len(untimed) == len(entries) == len(set(names)):
+        return [0] * len(entries), 1
+    if untimed:
+        raise HoloreelError(
+            f"{path}: time is missing for {untimed[0].listed} and {len(untimed) - 1} more; "
+            "give every picture of a moving scene its time, from 0 to 1."
+        )
+    return _even_frames(path, np.array([entry.time for entry in entries], dtype=np.float64))
+
+
+def _even_frames(path: Path, times: NDArray[np.float64]) -> tuple[list[int], int]:
+    """Number evenly spaced times (some may be left out): those of D-NeRF end at 1, ours before it, both are fine."""
+    span = float(np.ptp(times))
+    distinct = np.unique(times)
+    gaps = np.diff(distinct)
+    gaps = gaps[gaps > max(span * 1e-7, 1e-12)]
+    if not len(gaps):
+        return [0] * len(times), 1
+    step = span / max(round(span / float(gaps.min())), 1)
+    index = (times - times.min()) / step
+    count = round(span / step) + 1
+    if count > MAX_FRAMES or np.abs(index - np.round(index)).max() > 0.05:
+        raise HoloreelError(f"{path}: the times of the frames are not evenly spaced; resample the recording.")
+    return np.round(index).astype(int).tolist(), count
+
+
+def _splits(path: Path, meta: dict[str, Any], entries: list[_Entry], names: list[str]) -> dict[str, str]:
+    """A camera with a picture among val_filenames or test_filenames is held out."""
+    held_out: set[str] = set()
+    for key in ("val_filenames", "test_filenames"):
+        files = meta.get(key, [])
+        if not isinstance(files, list) or not all(isinstance(file, str) for file in files):
+            raise HoloreelError(f"{path}: {key} must be a list of file names.")
+        held_out.update(files)
+    test = {name for entry, name in zip(entries, names, strict=True) if entry.listed in held_out}
+    return {name: "test" if name in test else "train" for name in names}
+
+
+def _seeds(path: Path, meta: dict[str, Any], extra: dict[str, Any] | None, frame_count: int) -> dict[int, Path]:
+    """Seed points by frame; a foreign `ply_file_path` holds for every frame."""
+    seeds = extra.get("seeds") if extra else None
+    if seeds:
+        if not isinstance(seeds, list) or len(seeds) != frame_count:
+            raise HoloreelError(f"{path}: holoreel.seeds must name one file (or null) per frame.")
+        return {index: path.parent / seed for index, seed in enumerate(seeds) if isinstance(seed, str)}
+    ply = meta.get("ply_file_path")
+    return dict.fromkeys(range(frame_count), path.parent / ply) if isinstance(ply, str) else {}
