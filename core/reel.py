@@ -251,7 +251,7 @@ def check_reel(reel: Reel) -> None:
                 f"{reel.path}: '{name}' is {value!r}, not {wanted}; correct it or write the reel again."
             )
 
-    if reel.path.suffix != ".reel":
+    if reel.path.suffix.lower() != ".reel":
         raise HoloreelError(f"{reel.path} does not end in .reel: give it a name like {reel.path.stem or 'name'}.reel.")
     demand(_is_number(reel.fps) and 0 < reel.fps <= 1000, "fps", reel.fps, "a number from above 0 to 1000")
     demand(_is_int(reel.frame_start), "frame_start", reel.frame_start, "a whole number")

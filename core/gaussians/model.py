@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Spacetime Gaussians as arrays, and their evaluation at a time (Spacetime Gaussians, Sec. 4.1). Needs numpy only."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from typing import Any, Self
@@ -157,6 +158,11 @@ class SpacetimeGaussians:
             stable = -(half + np.copysign(np.sqrt(half * half - 3.0 * cubic * linear), half))
             return np.concatenate([stable / (3.0 * cubic), linear / stable])
 
+    def columns(self, name: str) -> Array:
+        """Return the parameter `name` as (N, columns), a view."""
+        array = getattr(self, name)
+        return array.reshape(len(array), math.prod(array.shape[1:]))
+
     def bad_rows(self) -> NDArray[np.bool_]:
         """Return an (N,) mask of rows that cannot be drawn: a value is NaN, infinite, or beyond what `ROWS` allows."""
         bad = np.zeros(len(self), dtype=bool)
@@ -166,7 +172,7 @@ class SpacetimeGaussians:
 
     def _bad_values(self, name: str) -> NDArray[np.bool_]:
         _, lowest, highest = ROWS[name]
-        values = getattr(self, name).reshape(len(self), -1)
+        values = self.columns(name)
         # Comparisons with NaN are false, so "not inside" catches it.
         return ~((values >= lowest) & (values <= highest)).all(axis=1)
 

@@ -90,7 +90,7 @@ def write_ply(path: str | Path, gaussians: SpacetimeGaussians) -> None:
     for parameter, columns in layout:
         if parameter is None:
             continue
-        values = getattr(gaussians, parameter).reshape(len(gaussians), -1)
+        values = gaussians.columns(parameter)
         if parameter == "features":  # split over f_dc and f_t
             values, feature = values[:, feature : feature + len(columns)], feature + len(columns)
         for name, column in zip(columns, values.T, strict=True):
