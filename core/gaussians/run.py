@@ -133,15 +133,15 @@ def _write_result(trainer: Trainer, paths: RunPaths) -> None:
     )
 
 
-def _capture_name(trainer: Trainer) -> str | None:
-    return trainer.capture.root.name if trainer.capture.root else None
+def _capture_name(trainer: Trainer) -> str:
+    return trainer.capture.source.resolve().parent.name
 
 
 def _record(trainer: Trainer) -> dict[str, object]:
     return {
         "config": asdict(trainer.config),
         "capture": _capture_name(trainer),
-        "train_cameras": trainer.names,
+        "train_cameras": trainer.capture.camera_names("train"),
         "gaussians": len(trainer.parameters),
         "seconds": round(trainer.seconds, 2),
         "versions": {"python": platform.python_version(), "torch": torch.__version__, "numpy": np.__version__},

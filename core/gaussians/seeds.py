@@ -6,6 +6,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from ..capture import Points
 from .config import TrainConfig
 from .model import SpacetimeGaussians
 
@@ -49,21 +50,18 @@ def split_static(
 
 
 def gaussians_from_points(
-    points: Sequence[tuple[NDArray[np.float32], NDArray[np.uint8]]], config: TrainConfig, rng: np.random.Generator
+    points: Sequence[Points], config: TrainConfig, rng: np.random.Generator
 ) -> SpacetimeGaussians:
-    """Make lite Spacetime Gaussians from one (xyz (N, 3), rgb (N, 3) uint8) pair per frame of a segment.
+    """Make lite Spacetime Gaussians from the points of each frame of a segment.
 
     Points that nearly every frame has in the same place become one long-lived Gaussian; the others become short-lived
-    ones centered at their frame. Sizes follow the distance to the nearest neighbors.
+    ones centered at their frame. Sizes follow the distance to the nearest neighbors. There must be a point.
     """
     frame_count = len(points)
-    xyz = np.concatenate([p for p, _ in points]).astype(np.float32)
-    rgb = np.concatenate([c for _, c in points]).astype(np.float32) / 255.0
-    frames = np.repeat(np.arange(frame_count), [len(p) for p, _ in points])
-    first = points[0][0]
-    sample = first[rng.permutation(len(first))[:20_000]]
-    # The spacing of the sample is that of the whole, widened as the square root of how much was left out (a surface).
-    spacing = float(np.median(neighbor_distances(sample))) * np.sqrt(len(sample) / max(len(first), 1))
+    xyz = np.concatenate([frame.xyz for frame in points])
+    rgb = np.concatenate([frame.rgb for frame in points]).astype(np.float32) / 255.0
+    frames = np.repeat(np.arange(frame_count), [len(frame) for frame in points])
+    spacing = _surface_spacing(max(points, key=len).xyz, rng)
 
     static = split_static(xyz, frames, frame_count, spacing) if frame_count > 1 else np.ones(len(xyz), dtype=bool)
     order = rng.permutation(len(xyz))
@@ -91,6 +89,13 @@ def gaussians_from_points(
         trbf_centers=np.where(static, 0.5, frames / frame_count).astype(np.float32),
         trbf_log_scales=np.log(np.where(static, config.static_width, config.moving_width)).astype(np.float32),
     )
+
+
+def _surface_spacing(xyz: NDArray[np.float32], rng: np.random.Generator) -> float:
+    """Return the typical distance between neighbors among points on surfaces, measured on some of them."""
+    sample = xyz[rng.permutation(len(xyz))[:20_000]]
+    # Leaving points out of a surface widens the distances as the square root.
+    return float(np.median(neighbor_distances(sample))) * float(np.sqrt(len(sample) / len(xyz)))
 
 
 def _thin(xyz: NDArray[np.float32], rows: NDArray[np.int64], spacing: float, limit: int) -> NDArray[np.int64]:

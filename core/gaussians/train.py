@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..capture import Capture
+from ..capture import Capture, View
 from ..errors import HoloreelError
 from .config import TrainConfig
 from .density import SceneScale, densify, empty_stats, prune, reset_opacities
@@ -39,34 +39,25 @@ class PictureCache:
     """Pictures of a capture as (H, W, 3) uint8, read when first asked for; the least recently used make room."""
 
     def __init__(self, capture: Capture, background: tuple[float, float, float], limit: int = CACHE_BYTES):
-        self.capture, self.background, self.limit, self.bytes = capture, np.asarray(background, np.float32), limit, 0
-        self.pictures: OrderedDict[tuple[str, int], np.ndarray] = OrderedDict()
+        self.capture, self.background, self.limit, self.bytes = capture, background, limit, 0
+        self.pictures: OrderedDict[View, np.ndarray] = OrderedDict()
 
-    def get(self, camera: str, frame: int) -> Tensor:
+    def get(self, view: View) -> Tensor:
         """Return one picture in display-referred [0, 1], (H, W, 3) float32, over the background."""
-        key = (camera, frame)
-        if key in self.pictures:
-            self.pictures.move_to_end(key)
+        if view in self.pictures:
+            self.pictures.move_to_end(view)
         else:
-            self.pictures[key] = self._read(camera, frame)
-            self.bytes += self.pictures[key].nbytes
+            self.pictures[view] = np.ascontiguousarray(self.capture.image(*view, background=self.background))
+            self.bytes += self.pictures[view].nbytes
             while self.bytes > self.limit and len(self.pictures) > 1:
                 self.bytes -= self.pictures.popitem(last=False)[1].nbytes
-        return torch.from_numpy(self.pictures[key]).to(torch.float32).mul_(1.0 / 255.0)
-
-    def _read(self, camera: str, frame: int) -> np.ndarray:
-        picture = self.capture.image(camera, frame)
-        if picture.shape[2] == 4:
-            alpha = picture[..., 3:].astype(np.float32) / 255.0
-            over = picture[..., :3] * alpha + 255.0 * self.background * (1 - alpha)
-            picture = np.rint(over).astype(np.uint8)
-        return np.ascontiguousarray(picture)
+        return torch.from_numpy(self.pictures[view]).to(torch.float32).mul_(1.0 / 255.0)
 
 
 def measure_scene(capture: Capture, points: np.ndarray) -> SceneScale:
     """Measure what one pixel covers at the seeds' median depth, and how near the seeds come to the training cameras."""
     footprints, nearest = [], math.inf
-    cameras = [capture.cameras[name] for name in capture.names("train")]
+    cameras = [capture.cameras[name] for name in capture.camera_names("train")]
     for camera in cameras:
         uv, depth = camera.project(points)
         seen = (depth > 0) & (uv >= 0).all(axis=1) & (uv < (camera.width, camera.height)).all(axis=1)
@@ -75,7 +66,7 @@ def measure_scene(capture: Capture, points: np.ndarray) -> SceneScale:
             nearest = min(nearest, float(np.quantile(depth[seen], 0.001)))
     if not footprints:
         raise HoloreelError(
-            f"{capture.root}: no training camera sees any of the capture's seed points; "
+            f"{capture.source}: no training camera sees any of the capture's seed points; "
             "check that points and cameras share one world."
         )
     centers = torch.tensor(np.stack([camera.center for camera in cameras]), dtype=torch.float32)
@@ -87,16 +78,18 @@ class Trainer:
 
     def __init__(self, capture: Capture, config: TrainConfig, backend: ModuleType):
         self.capture, self.config, self.backend = capture, config, backend
-        self.names = capture.names("train")
-        if not self.names:
-            raise HoloreelError(f"{capture.root}: all cameras are held out; leave at least one in the training split.")
-        points = [capture.seed_points(frame) for frame in range(capture.frame_count)]
-        if not sum(len(xyz) for xyz, _ in points):
+        self.views = capture.views("train")
+        if not self.views:
             raise HoloreelError(
-                f"{capture.root}: the capture has no seed points (ply_file_path in transforms.json); "
+                f"{capture.source}: no camera of the training split has a picture; hold fewer cameras out."
+            )
+        points = [capture.seed_points(frame) for frame in range(capture.frame_count)]
+        if not sum(len(frame.xyz) for frame in points):
+            raise HoloreelError(
+                f"{capture.source}: the capture has no seed points (ply_file_path in transforms.json); "
                 "synthesize it with --seed-points or add a point cloud."
             )
-        self.scene = measure_scene(capture, np.concatenate([xyz for xyz, _ in points]))
+        self.scene = measure_scene(capture, np.concatenate([frame.xyz for frame in points]))
         self.times = torch.tensor(capture.times, dtype=torch.float32)
         self.background = torch.tensor(config.background)
         self.rng = torch.Generator().manual_seed(config.seed)
@@ -138,10 +131,10 @@ class Trainer:
 
     def step(self) -> tuple[float, float]:
         """Look at one picture and learn from it; return the loss and the mean squared error."""
-        name, frame = self._next_view()
-        camera, target = self.capture.cameras[name], self.pictures.get(name, frame)
+        view = self._next_view()
+        camera, target = self.capture.cameras[view[0]], self.pictures.get(view)
         rendering = self.backend.rasterize_spacetime(
-            self.parameters.spacetime, float(self.times[frame]), camera, self.background, density=self.stats
+            self.parameters.spacetime, self.capture.time(view[1]), camera, self.background, density=self.stats
         )
         loss = self.backend.l1_dssim(rendering.features, target, self.config.dssim_weight)
         loss.backward()
@@ -151,12 +144,11 @@ class Trainer:
         self._control_density(camera.width)
         return float(loss.detach()), mse
 
-    def _next_view(self) -> tuple[str, int]:
+    def _next_view(self) -> View:
         """Draw pictures in a random order, each once before any comes again."""
         if not self.queue:
-            self.queue = torch.randperm(len(self.names) * self.capture.frame_count, generator=self.rng).tolist()
-        camera, frame = divmod(self.queue.pop(), self.capture.frame_count)
-        return self.names[camera], frame
+            self.queue = torch.randperm(len(self.views), generator=self.rng).tolist()
+        return self.views[self.queue.pop()]
 
     def _rates(self) -> Mapping[str, float]:
         """Return the learning rate of each tensor at this iteration."""
@@ -186,7 +178,7 @@ class Trainer:
                 setattr(self.stats, name, getattr(self.stats, name)[keep])
             if not len(self.parameters):
                 raise HoloreelError(
-                    f"{self.capture.root}: every Gaussian was pruned at iteration {self.iteration}; "
+                    f"{self.capture.source}: every Gaussian was pruned at iteration {self.iteration}; "
                     "check the cameras, or lower --density.prune-opacity."
                 )
         if self.iteration in self.reset_at:

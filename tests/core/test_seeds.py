@@ -3,13 +3,14 @@
 
 import numpy as np
 import pytest
+from holoreel.core.capture import Points
 from holoreel.core.gaussians.config import TrainConfig
 from holoreel.core.gaussians.seeds import gaussians_from_points, neighbor_distances
 
 FRAMES = 8
 
 
-def wall_and_ball(rng: np.random.Generator) -> list[tuple[np.ndarray, np.ndarray]]:
+def wall_and_ball(rng: np.random.Generator) -> list[Points]:
     """A gray wall at y = 0 that stays, and a red ball above it that moves its own size per frame."""
     frames = []
     for frame in range(FRAMES):
@@ -17,7 +18,7 @@ def wall_and_ball(rng: np.random.Generator) -> list[tuple[np.ndarray, np.ndarray
         ball = rng.normal(size=(200, 3))
         ball = 0.2 * ball / np.linalg.norm(ball, axis=1, keepdims=True) + [0.5 * frame - 2.0, 2.0, 0.0]
         rgb = np.concatenate([np.full((3000, 3), 128), np.tile([255, 0, 0], (200, 1))]).astype(np.uint8)
-        frames.append((np.concatenate([wall, ball]).astype(np.float32), rgb))
+        frames.append(Points(np.concatenate([wall, ball]).astype(np.float32), rgb))
     return frames
 
 
@@ -38,7 +39,7 @@ def test_still_and_moving_points_are_told_apart() -> None:
 def test_seeds_are_points_of_the_capture_and_the_limit_holds() -> None:
     points = wall_and_ball(np.random.default_rng(0))
     gaussians = gaussians_from_points(points, TrainConfig(max_seeds=1500), np.random.default_rng(1))
-    given = {tuple(row) for xyz, _ in points for row in xyz.tolist()}
+    given = {tuple(row) for frame in points for row in frame.xyz.tolist()}
     assert len(gaussians) <= 1500
     assert all(tuple(row) in given for row in gaussians.means.tolist())
 
@@ -47,7 +48,7 @@ def test_seeds_are_points_of_the_capture_and_the_limit_holds() -> None:
 def test_the_unit_of_the_scene_does_not_matter(unit: float) -> None:
     points = wall_and_ball(np.random.default_rng(0))
     one = gaussians_from_points(points, TrainConfig(), np.random.default_rng(1))
-    scaled = [((xyz * unit).astype(np.float32), rgb) for xyz, rgb in points]
+    scaled = [Points((frame.xyz * unit).astype(np.float32), frame.rgb) for frame in points]
     other = gaussians_from_points(scaled, TrainConfig(), np.random.default_rng(1))
     assert abs(len(one) - len(other)) < 0.02 * len(one)
     assert np.median(np.exp(other.log_scales)) == pytest.approx(unit * np.median(np.exp(one.log_scales)), rel=0.05)
