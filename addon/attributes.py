@@ -1,0 +1,102 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The point attributes of a reel: one table, from Spacetime Gaussians to Blender's types.
+
+Attributes with the prefix `stg_` hold what the node group "Holoreel Evaluate" consumes; the others are there after it too.
+Quaternions travel as FLOAT_COLOR, because nodes can calculate with a color's four numbers but not with a rotation's.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from enum import Enum
+
+import bpy
+import numpy as np
+from numpy.typing import NDArray
+
+from ..core.gaussians.model import SpacetimeGaussians, sigmoid
+
+PREFIX = "stg_"
+INVERSE_WIDTH_MAX = 1e18  # its square still fits into float32
+
+
+class Kind(Enum):
+    """A type of attribute: Blender's name, the property that `foreach_set` writes, numbers per point."""
+
+    FLOAT = ("FLOAT", "value", 1)
+    VECTOR = ("FLOAT_VECTOR", "vector", 3)
+    COLOR = ("FLOAT_COLOR", "color", 4)
+
+    @property
+    def type_name(self) -> str:
+        """Blender's name of the type."""
+        return self.value[0]
+
+    @property
+    def property_name(self) -> str:
+        """The property of one element that holds its numbers."""
+        return self.value[1]
+
+    @property
+    def width(self) -> int:
+        """Numbers per point."""
+        return self.value[2]
+
+
+@dataclass(frozen=True)
+class Attribute:
+    """One row of the table: `read` returns (N,) or (N, width) from the model."""
+
+    name: str
+    kind: Kind
+    read: Callable[[SpacetimeGaussians], NDArray[np.float32]]
+
+
+def _opacity(gaussians: SpacetimeGaussians) -> NDArray[np.float32]:
+    return sigmoid(gaussians.opacity_logits.astype(np.float64)).astype(np.float32)
+
+
+def _inverse_width(gaussians: SpacetimeGaussians) -> NDArray[np.float32]:
+    with np.errstate(over="ignore"):
+        return np.minimum(np.exp(-gaussians.trbf_log_scales.astype(np.float64)), INVERSE_WIDTH_MAX).astype(np.float32)
+
+
+def _color(gaussians: SpacetimeGaussians) -> NDArray[np.float32]:
+    color = np.ones((len(gaussians), 4), np.float32)
+    color[:, :3] = gaussians.features[:, :3]
+    return color
+
+
+TABLE = (
+    Attribute("position", Kind.VECTOR, lambda g: g.means),
+    Attribute("stg_motion_1", Kind.VECTOR, lambda g: g.motions[:, 0]),
+    Attribute("stg_motion_2", Kind.VECTOR, lambda g: g.motions[:, 1]),
+    Attribute("stg_motion_3", Kind.VECTOR, lambda g: g.motions[:, 2]),
+    Attribute("stg_quat", Kind.COLOR, lambda g: g.quats),
+    Attribute("stg_omega", Kind.COLOR, lambda g: g.omegas),
+    Attribute("stg_opacity", Kind.FLOAT, _opacity),
+    Attribute("stg_center", Kind.FLOAT, lambda g: g.trbf_centers),
+    Attribute("stg_inverse_width", Kind.FLOAT, _inverse_width),
+    Attribute("scale", Kind.VECTOR, lambda g: np.exp(g.log_scales)),
+    Attribute("rgb", Kind.COLOR, _color),
+)
+
+
+def write(cloud: bpy.types.PointCloud, gaussians: SpacetimeGaussians) -> None:
+    """Write the whole table into a point cloud that has as many points as there are Gaussians."""
+    # All are created before any is filled: creating one may move the others.
+    for row in TABLE:
+        if row.name not in cloud.attributes:
+            cloud.attributes.new(row.name, row.kind.type_name, "POINT")
+    for row in TABLE:
+        values = np.ascontiguousarray(row.read(gaussians), dtype=np.float32)
+        cloud.attributes[row.name].data.foreach_set(row.kind.property_name, values.ravel())
+
+
+def read(attributes: bpy.types.AttributeGroupPointCloud, name: str) -> NDArray[np.float32]:
+    """Return a float attribute as (N,) or (N, width); quaternions come as w x y z."""
+    widths = {kind.type_name: (kind.property_name, kind.width) for kind in Kind} | {"QUATERNION": ("value", 4)}
+    attribute = attributes[name]
+    property_name, width = widths[attribute.data_type]
+    values = np.empty(len(attribute.data) * width, np.float32)
+    attribute.data.foreach_get(property_name, values)
+    return values if width == 1 else values.reshape(-1, width)

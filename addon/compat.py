@@ -1,0 +1,137 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Everything in which the supported Blender versions (4.5 LTS, 5.2 LTS) differ.
+
+Features are detected where they can be; nothing outside this file asks for a version.
+"""
+
+from typing import Any
+
+import bpy
+
+# --- Geometry Nodes modifiers ---------------------------------------------------------------------------------------
+# Up to 4.5 the inputs of a modifier are ID properties, `modifier["Socket_2"]`; later they are real properties,
+# `modifier.properties.inputs.Socket_2.value`, and the old form raises.
+
+
+def has_input_properties(modifier: bpy.types.NodesModifier) -> bool:
+    """Return whether the modifier's inputs are real properties."""
+    return hasattr(modifier, "properties")
+
+
+def input_identifier(group: bpy.types.NodeTree, name: str) -> str:
+    """Return the identifier of the group input called `name`; KeyError if there is none."""
+    for item in group.interface.items_tree:
+        if item.item_type == "SOCKET" and item.in_out == "INPUT" and item.name == name:
+            return item.identifier
+    raise KeyError(name)
+
+
+def _menu_values(modifier: bpy.types.NodesModifier, identifier: str) -> dict[str, int]:
+    items = modifier.id_properties_ui(identifier).as_dict().get("items") or ()
+    return {item[0]: item[4] for item in items}
+
+
+def get_input(modifier: bpy.types.NodesModifier, name: str) -> Any:
+    """Return the value of the modifier's input `name`; a menu's value is the name of its item."""
+    identifier = input_identifier(modifier.node_group, name)
+    if has_input_properties(modifier):
+        return getattr(modifier.properties.inputs, identifier).value
+    value = modifier[identifier]
+    if isinstance(value, int) and not isinstance(value, bool):
+        for item, number in _menu_values(modifier, identifier).items():
+            if number == value:
+                return item
+    return value
+
+
+def set_input(modifier: bpy.types.NodesModifier, name: str, value: Any) -> None:
+    """Set the modifier's input `name`; a menu takes the name of its item."""
+    identifier = input_identifier(modifier.node_group, name)
+    if has_input_properties(modifier):
+        getattr(modifier.properties.inputs, identifier).value = value
+        return
+    current = modifier[identifier]
+    if isinstance(value, str) and isinstance(current, int):
+        value = _menu_values(modifier, identifier)[value]
+    modifier[identifier] = type(current)(value) if isinstance(current, (bool, int, float)) else value
+    modifier.id_data.update_tag()  # an ID property changes without telling the dependency graph
+
+
+def input_path(modifier: bpy.types.NodesModifier, name: str) -> str:
+    """Return the data path from the object to the modifier's input `name`, for drivers and keyframes."""
+    identifier = input_identifier(modifier.node_group, name)
+    if has_input_properties(modifier):
+        return f'modifiers["{modifier.name}"].properties.inputs.{identifier}.value'
+    return f'modifiers["{modifier.name}"]["{identifier}"]'
+
+
+def draw_input(
+    layout: bpy.types.UILayout, modifier: bpy.types.NodesModifier, name: str, text: str | None = None
+) -> None:
+    """Draw the modifier's input `name` in a panel."""
+    identifier = input_identifier(modifier.node_group, name)
+    label = name if text is None else text
+    if has_input_properties(modifier):
+        layout.prop(getattr(modifier.properties.inputs, identifier), "value", text=label)
+    else:
+        layout.prop(modifier, f'["{identifier}"]', text=label)
+
+
+# --- Point clouds ---------------------------------------------------------------------------------------------------
+
+
+def new_point_cloud(context: bpy.types.Context, name: str, count: int) -> bpy.types.Object:
+    """Return a new POINTCLOUD object with `count` points at the origin, linked to the scene's root collection.
+
+    Needs Object Mode where `PointCloud.resize` is missing (4.5), because a mesh is converted there.
+    """
+    if hasattr(bpy.types.PointCloud, "resize"):
+        data = bpy.data.pointclouds.new(name)
+        data.resize(count)
+        created = bpy.data.objects.new(name, data)
+        context.scene.collection.objects.link(created)
+        return created
+    mesh = bpy.data.meshes.new(name)
+    mesh.vertices.add(count)
+    created = bpy.data.objects.new(name, mesh)
+    context.scene.collection.objects.link(created)
+    with context.temp_override(
+        object=created, active_object=created, selected_objects=[created], selected_editable_objects=[created]
+    ):
+        bpy.ops.object.convert(target="POINTCLOUD")
+    if mesh.users == 0:
+        bpy.data.meshes.remove(mesh)
+    return created
+
+
+# --- Nodes and materials --------------------------------------------------------------------------------------------
+
+
+def enable_nodes(material: bpy.types.Material) -> None:
+    """Give a new material its node tree (later versions always have one, and say that asking is deprecated)."""
+    if material.node_tree is None:
+        material.use_nodes = True
+
+
+def set_wildcard(node: bpy.types.Node) -> None:
+    """Let a Remove Named Attribute node take a pattern with `*`."""
+    if "Pattern Mode" in node.inputs:
+        node.inputs["Pattern Mode"].default_value = "Wildcard"
+    else:
+        node.pattern_mode = "WILDCARD"
+
+
+# --- Rendering ------------------------------------------------------------------------------------------------------
+
+
+def eevee_engine() -> str:
+    """Return the identifier of EEVEE: `BLENDER_EEVEE_NEXT` in 4.5, `BLENDER_EEVEE` later."""
+    engines = bpy.types.RenderSettings.bl_rna.properties["engine"].enum_items.keys()
+    return "BLENDER_EEVEE_NEXT" if "BLENDER_EEVEE_NEXT" in engines else "BLENDER_EEVEE"
+
+
+def set_image_format(settings: bpy.types.ImageFormatSettings, file_format: str) -> None:
+    """Choose an image format; where formats are sorted by media type, choose that first."""
+    if hasattr(settings, "media_type"):
+        settings.media_type = "MULTI_LAYER_IMAGE" if file_format == "OPEN_EXR_MULTILAYER" else "IMAGE"
+    settings.file_format = file_format

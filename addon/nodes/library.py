@@ -1,0 +1,50 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Data-blocks that are built from code once per .blend file and found again afterwards by a tag."""
+
+from collections.abc import Callable
+
+import bpy
+
+from .builder import Tree
+
+TAG = "holoreel"  # custom property that holds "name version"
+
+
+def find(collection: bpy.types.bpy_prop_collection, name: str, version: int) -> bpy.types.ID | None:
+    """Return the local data-block tagged `name version`, whatever it is called now."""
+    for block in collection:
+        if block.library is None and block.get(TAG) == f"{name} {version}":
+            return block
+    return None
+
+
+def tag(block: bpy.types.ID, name: str, version: int) -> None:
+    """Mark a data-block so that `find` finds it."""
+    block[TAG] = f"{name} {version}"
+
+
+def node_group(
+    name: str, version: int, tooltip: str
+) -> Callable[[Callable[[Tree], None]], Callable[[], bpy.types.NodeTree]]:
+    """Turn a function that fills a `Tree` into one that returns the group, built at most once per .blend file.
+
+    Raise `version` with every change of a group's nodes or sockets: files made earlier keep their own.
+    """
+
+    def decorate(build: Callable[[Tree], None]) -> Callable[[], bpy.types.NodeTree]:
+        def ensure() -> bpy.types.NodeTree:
+            group = find(bpy.data.node_groups, name, version)
+            if group is None:
+                group = bpy.data.node_groups.new(name, "GeometryNodeTree")
+                group.description = tooltip
+                tree = Tree(group)
+                build(tree)
+                tree.arrange()
+                tag(group, name, version)
+            return group
+
+        ensure.__name__ = build.__name__
+        ensure.__doc__ = build.__doc__
+        return ensure
+
+    return decorate

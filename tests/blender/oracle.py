@@ -1,0 +1,69 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""EWA splatting in plain numpy (float64), written from its definition: what the look Splats is measured against."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from holoreel.core.gaussians.model import EvaluatedGaussians
+from numpy.typing import NDArray
+
+ALPHA_MAX, ALPHA_MIN, STOP, LOW_PASS, NEAR, CLAMP = 0.99, 1 / 255, 1e-4, 0.3, 0.2, 1.3
+
+
+@dataclass
+class View:
+    """A pinhole camera: pixels, focal lengths and principal point in pixels, world-to-camera (OpenCV axes)."""
+
+    width: int
+    height: int
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    world_to_camera: NDArray[np.float64]
+
+
+def rotations(quats: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return (N, 3, 3) from unit quaternions w x y z."""
+    w, x, y, z = quats.T
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    return np.array(rows).transpose(2, 0, 1)
+
+
+def splat(gaussians: EvaluatedGaussians, view: View, stop: float = STOP) -> NDArray[np.float64]:
+    """Return premultiplied RGBA (H, W, 4) of the visible Gaussians over nothing."""
+    alive = gaussians.take(gaussians.alive)
+    rotation, translation = view.world_to_camera[:3, :3], view.world_to_camera[:3, 3]
+    places = alive.means.astype(np.float64) @ rotation.T + translation
+    spreads = rotations(alive.quats.astype(np.float64)) * alive.scales.astype(np.float64)[:, None, :]
+    columns, rows = np.meshgrid(np.arange(view.width) + 0.5, np.arange(view.height) + 0.5)
+    color, through = np.zeros((view.height, view.width, 3)), np.ones((view.height, view.width))
+    stopped = np.zeros_like(through, dtype=bool)
+    limit_x, limit_y = CLAMP * 0.5 * view.width / view.fx, CLAMP * 0.5 * view.height / view.fy
+    for index in np.argsort(places[:, 2], kind="stable"):
+        x, y, z = places[index]
+        if z < NEAR:
+            continue
+        slope_x, slope_y = np.clip(x / z, -limit_x, limit_x), np.clip(y / z, -limit_y, limit_y)
+        jacobian = np.array([[view.fx / z, 0, -view.fx * slope_x / z], [0, view.fy / z, -view.fy * slope_y / z]])
+        spread = jacobian @ rotation @ spreads[index]
+        conic = np.linalg.inv(spread @ spread.T + LOW_PASS * np.eye(2))
+        dx, dy = columns - (view.fx * x / z + view.cx), rows - (view.fy * y / z + view.cy)
+        power = conic[0, 0] * dx * dx + 2 * conic[0, 1] * dx * dy + conic[1, 1] * dy * dy
+        alpha = np.minimum(ALPHA_MAX, alive.opacities[index] * np.exp(-0.5 * power))
+        alpha = np.where((alpha < ALPHA_MIN) | stopped, 0.0, alpha)
+        stopped |= (alpha > 0) & (through * (1 - alpha) < stop)
+        alpha[stopped] = 0.0
+        color += (through * alpha)[..., None] * alive.features[index, :3]
+        through *= 1 - alpha
+    return np.concatenate([color, 1 - through[..., None]], axis=-1)
+
+
+def psnr(picture: NDArray, truth: NDArray) -> float:
+    """Return the peak signal-to-noise ratio in dB, for a peak of 1."""
+    error = np.mean(np.square(picture.astype(np.float64) - truth))
+    return float("inf") if error == 0 else -10.0 * float(np.log10(error))
