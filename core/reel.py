@@ -4,7 +4,8 @@
 A reel is a JSON file `NAME.reel` that ties together payload files beside it (or in folders below it):
 
     {"kind": "spacetime_gaussians", "version": 1, "fps": 24.0, "frame_start": 1, "frame_count": 50,
-     "bounds": [[x, y, z], [x, y, z]], "up": "Z", "color_space": "display", "decoder": null, "variant": "lite",
+     "bounds": [[x, y, z], [x, y, z]], "up": "Z", "color_space": "display", "background": [0, 0, 0],
+     "decoder": null, "variant": "lite",
      "segments": [{"file": "NAME.ply", "frame_start": 1, "frame_count": 50}],
      "files": {"metrics": "metrics.json"}, "provenance": {...}}
 
@@ -28,7 +29,8 @@ COLOR_SPACES = ("display",)  # colors are sRGB as displayed: what was seen in th
 BARE_FRAME_COUNT = 50  # what the authors train on, and assumed where a file does not say
 BARE_FPS = 30.0
 
-Bounds = tuple[tuple[float, float, float], tuple[float, float, float]]
+Triple = tuple[float, float, float]
+Bounds = tuple[Triple, Triple]
 
 
 @dataclass(frozen=True)
@@ -45,7 +47,8 @@ class Reel:
     """What a `.reel` manifest says.
 
     `bounds` is the box of the visible Gaussians' centers (lowest, highest corner), `up` the world axis that points up
-    (None where unknown), `files` names further files by purpose (`config`, `metrics`, `log`); `provenance` is free.
+    (None where unknown), `background` the color the Gaussians were trained over. `files` names further files by purpose
+    (`config`, `metrics`, `log`); `provenance` is free.
     """
 
     path: Path
@@ -57,6 +60,7 @@ class Reel:
     bounds: Bounds | None = None
     up: str | None = None
     color_space: str = "display"
+    background: Triple = (0.0, 0.0, 0.0)
     files: dict[str, str] = field(default_factory=dict)
     provenance: dict[str, Any] = field(default_factory=dict)
 
@@ -90,6 +94,7 @@ class Loaded:
     frame_count: int
     up: str | None
     color_space: str
+    background: Triple
     report: list[str]
     reel: Reel | None = None
 
@@ -123,6 +128,7 @@ def load_gaussians(path: str | Path, segment: int = 0) -> Loaded:
         frame_count=BARE_FRAME_COUNT,
         up=None,
         color_space="display",
+        background=(0.0, 0.0, 0.0),
         report=[assumed, *report],
     )
 
@@ -149,6 +155,7 @@ def _load_reel(path: Path, index: int) -> Loaded:
         frame_count=segment.frame_count,
         up=reel.up,
         color_space=reel.color_space,
+        background=reel.background,
         report=report,
         reel=reel,
     )
@@ -162,6 +169,7 @@ def save_gaussians(
     frame_start: int,
     frame_count: int,
     up: str | None = None,
+    background: Triple = (0.0, 0.0, 0.0),
     files: dict[str, str] | None = None,
     provenance: dict[str, Any] | None = None,
 ) -> Reel:
@@ -177,6 +185,7 @@ def save_gaussians(
         variant=gaussians.variant,
         bounds=None if box is None else _parse_bounds(path, box.tolist()),
         up=up,
+        background=background,
         files=files or {},
         provenance=provenance or {},
     )
@@ -198,6 +207,7 @@ def write_reel(reel: Reel) -> None:
         "bounds": reel.bounds,
         "up": reel.up,
         "color_space": reel.color_space,
+        "background": reel.background,
         "decoder": None,
         "variant": reel.variant,
         "segments": [vars(segment) for segment in reel.segments],
@@ -235,6 +245,7 @@ def read_reel(path: str | Path) -> Reel:
         bounds=_parse_bounds(path, manifest.get("bounds")),
         up=manifest.get("up"),
         color_space=manifest.get("color_space", ""),
+        background=_parse_triple(path, "background", manifest.get("background", (0.0, 0.0, 0.0))),
         files=manifest.get("files", {}),
         provenance=manifest.get("provenance", {}),
     )
@@ -283,15 +294,18 @@ def check_reel(reel: Reel) -> None:
 def _parse_bounds(path: Path, value: Any) -> Bounds | None:
     if value is None:
         return None
-    try:
-        (a, b, c), (d, e, f) = value
-    except (TypeError, ValueError):
-        a = b = c = d = e = f = None
-    if not all(_is_number(x) for x in (a, b, c, d, e, f)) or a > d or b > e or c > f:
-        raise HoloreelError(
-            f"{path}: 'bounds' is not [[x, y, z], [x, y, z]], lowest corner first; write the reel again."
-        )
-    return (a, b, c), (d, e, f)
+    if not isinstance(value, list | tuple) or len(value) != 2:
+        raise HoloreelError(f"{path}: 'bounds' is not [lowest corner, highest corner] or null; write the reel again.")
+    low, high = _parse_triple(path, "bounds", value[0]), _parse_triple(path, "bounds", value[1])
+    if any(a > b for a, b in zip(low, high, strict=True)):
+        raise HoloreelError(f"{path}: 'bounds' does not have its lowest corner first; write the reel again.")
+    return low, high
+
+
+def _parse_triple(path: Path, name: str, value: Any) -> Triple:
+    if not isinstance(value, list | tuple) or len(value) != 3 or not all(_is_number(part) for part in value):
+        raise HoloreelError(f"{path}: '{name}' has {value!r} where three finite numbers belong; write the reel again.")
+    return float(value[0]), float(value[1]), float(value[2])
 
 
 def _is_int(value: Any) -> bool:

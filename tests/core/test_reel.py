@@ -16,7 +16,7 @@ from holoreel.core.reel import Segment, load_gaussians, read_reel, save_gaussian
 def saved(tmp_path, random_model):
     return save_gaussians(
         tmp_path / "out" / "a.reel", random_model(30), fps=24, frame_start=101, frame_count=12, up="Z",
-        files={"metrics": "logs/metrics.json"}, provenance={"trainer": {"seed": 3}},
+        background=(0.25, 0.5, 1.0), files={"metrics": "logs/metrics.json"}, provenance={"trainer": {"seed": 3}},
     )  # fmt: skip
 
 
@@ -39,7 +39,7 @@ def test_a_reel_comes_back_as_it_went(saved, random_model):
     assert read_reel(saved.path) == saved
     loaded = load_gaussians(saved.path)
     assert (loaded.kind, loaded.fps, loaded.frame_start, loaded.frame_count, loaded.up) == ("reel", 24.0, 101, 12, "Z")
-    assert (loaded.color_space, loaded.report) == ("display", [])
+    assert (loaded.color_space, loaded.background, loaded.report) == ("display", (0.25, 0.5, 1.0), [])
     for name in ROWS:
         np.testing.assert_array_equal(getattr(loaded.gaussians, name), getattr(random_model(30), name))
     np.testing.assert_allclose(saved.bounds, random_model(30).bounds())
@@ -78,7 +78,8 @@ def test_bare_files_have_assumed_lengths(tmp_path, random_model):
         ("frame_count", 10**12), ("frame_count", 13), ("frame_count", True), ("variant", "medium"),
         ("variant", KeyError), ("bounds", [1, 2]), ("bounds", [[0, 0, 0], [1, 1, -1]]), ("bounds", 7),
         ("bounds", [["a"] * 3] * 2), ("bounds", [[0, 0, float("nan")], [1, 1, 1]]), ("up", "W"), ("up", ["Z"]),
-        ("color_space", "acescg"), ("color_space", KeyError), ("decoder", {"file": "a.pt"}), ("files", []),
+        ("color_space", "acescg"), ("color_space", KeyError), ("background", [0, 1]), ("background", None),
+        ("background", "red"), ("decoder", {"file": "a.pt"}), ("files", []),
         ("files", {"metrics": "../m.json"}), ("provenance", 3), ("segments", []), ("segments", {}),
         ("segments", ["a.ply"]), ("segments", None), ("segments__0__file", "/etc/a.ply"),
         ("segments__0__file", "../a.ply"), ("segments__0__file", "b/../../a.ply"), ("segments__0__file", "..\\a.ply"),
