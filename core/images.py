@@ -4,6 +4,7 @@
 The libraries are imported where they are used, so that importing this module needs numpy alone.
 """
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -77,6 +78,12 @@ def write_exr(path: str | Path, image: NDArray[np.floating], depth: NDArray[np.f
     header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
     with atomic_path(path) as temporary, OpenEXR.File(header, channels) as file:
         file.write(str(temporary))
+
+
+def picture_path(folder: Path, camera: str, frame: str | int, suffix: str = ".png") -> Path:
+    """Return FOLDER/CAMERA/FRAME.png: whatever a file calls its cameras, the path stays inside the folder."""
+    name = re.sub(r"[^\w.-]", "_", camera).lstrip(".") or "camera"
+    return folder / name / (f"{frame:04d}{suffix}" if isinstance(frame, int) else f"{frame}{suffix}")
 
 
 def write_image(path: str | Path, image: NDArray[np.floating], depth: NDArray[np.floating] | None = None) -> None:

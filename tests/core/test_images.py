@@ -4,7 +4,7 @@
 import numpy as np
 import pytest
 from holoreel.core.errors import HoloreelError
-from holoreel.core.images import read_exr, read_image, write_exr, write_image, write_png
+from holoreel.core.images import picture_path, read_exr, read_image, write_exr, write_image, write_png
 
 
 @pytest.mark.parametrize("channels", [3, 4])
@@ -68,3 +68,10 @@ def test_other_endings_and_unwritable_folders_are_refused(tmp_path):
         with pytest.raises(HoloreelError, match="cannot be written"):
             write_image(tmp_path / name, np.zeros((2, 2, 3)))
     assert [path.name for path in tmp_path.iterdir()] == ["file"]
+
+
+def test_no_camera_name_leaves_the_folder(tmp_path):
+    assert picture_path(tmp_path, "cam00", 7) == tmp_path / "cam00" / "0007.png"
+    assert picture_path(tmp_path, "a b", "12.5", ".exr") == tmp_path / "a_b" / "12.5.exr"
+    for name in ("../../x", "/etc", "..", "C:\\x", "a/../../b", "", "\0"):
+        assert picture_path(tmp_path, name, 1).resolve().parent.parent == tmp_path.resolve()

@@ -1,0 +1,134 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""`holoreel info FILE`: what a reel, PLY, .splatv or capture holds, and what is wrong with it."""
+
+import json
+from pathlib import Path
+from typing import Annotated, Any
+
+import tyro
+
+from ..capture import read_capture
+from ..reel import Loaded, load_gaussians
+
+
+def run(file: tyro.conf.Positional[Path], /, as_json: Annotated[bool, tyro.conf.arg(name="json")] = False) -> None:
+    """Say what a file holds, and what is unusual or wrong.
+
+    Args:
+        file: a .reel, .ply or .splatv, or a capture (folder or transforms.json).
+        as_json: print JSON for programs to read.
+    """
+    facts = describe(file)
+    print(json.dumps(facts, indent=1, allow_nan=False) if as_json else table(facts))
+
+
+def describe(path: Path) -> dict[str, Any]:
+    """Return the facts about one file, ready for JSON; `problems` lists sentences."""
+    if path.is_dir() or path.suffix.lower() == ".json":
+        return describe_capture(path)
+    loaded = load_gaussians(path)
+    return describe_reel(loaded) if loaded.reel else describe_gaussians(loaded)
+
+
+def describe_gaussians(loaded: Loaded) -> dict[str, Any]:
+    """Return the facts about one payload of Gaussians."""
+    gaussians = loaded.gaussians
+    box = gaussians.bounds()
+    lives = gaussians.lifetimes()
+    visible = [len(gaussians.evaluate(time).alive) for time in (0.0, 0.5, 0.98)]
+    return {
+        "file": str(loaded.path),
+        "what": f"{gaussians.variant} Spacetime Gaussians in a {loaded.kind} file",
+        "gaussians": len(gaussians),
+        "visible at 0, 0.5, 0.98": visible,
+        "visible throughout": int(((lives[:, 0] <= 0.0) & (lives[:, 1] >= 1.0)).sum()),
+        "frames": f"{loaded.frame_count} from frame {loaded.frame_start} at {loaded.fps:g} fps",
+        "temporal centers": [float(gaussians.trbf_centers.min()), float(gaussians.trbf_centers.max())],
+        "bounds": None if box is None else box.tolist(),
+        "up": loaded.up,
+        "bytes in memory": sum(array.nbytes for array in vars(gaussians).values()),
+        "bytes on disk": loaded.path.stat().st_size,
+        "problems": [*loaded.report, *gaussians.problems()],
+    }
+
+
+def describe_reel(first: Loaded) -> dict[str, Any]:
+    """Return the facts about a reel: its first segment's, with the numbers of all segments."""
+    reel = first.reel
+    assert reel is not None
+    parts = [describe_gaussians(first)]
+    parts += [describe_gaussians(load_gaussians(reel.path, index)) for index in range(1, len(reel.segments))]
+    problems = [(part.pop("problems"), segment.file) for part, segment in zip(parts, reel.segments, strict=True)]
+    return parts[0] | {
+        "what": f"a reel of {reel.variant} Spacetime Gaussians",
+        "segments": [f"{s.file}: {s.frame_count} frames from {s.frame_start}" for s in reel.segments],
+        "gaussians": sum(part["gaussians"] for part in parts),
+        "frames": f"{reel.frame_count} from frame {reel.frame_start} at {reel.fps:g} fps",
+        "bounds": reel.bounds,
+        "color space": reel.color_space,
+        "background": reel.background,
+        "files": reel.files,
+        "bytes in memory": sum(part["bytes in memory"] for part in parts),
+        "bytes on disk": reel.path.stat().st_size
+        + sum(reel.payload(index).stat().st_size for index in range(len(reel.segments))),
+        "problems": [f"{file}: {sentence}" for sentences, file in problems for sentence in sentences],
+    }
+
+
+def describe_capture(path: Path) -> dict[str, Any]:
+    """Return the facts about a capture; that all its files exist was checked on reading."""
+    capture = read_capture(path)
+    missing = len(capture.cameras) * capture.frame_count - len(capture.images)
+    problems = []
+    if missing:
+        problems.append(f"{missing} pictures of camera and frame do not exist.")
+    if not capture.camera_names("test"):
+        problems.append("No camera is held out for testing: eval needs --split train.")
+    if not capture.seeds:
+        problems.append("There are no seed points: training has nothing to start from.")
+    return {
+        "file": str(capture.source),
+        "what": "a multi-view capture",
+        "cameras": {
+            name: f"{camera.width}x{camera.height} {camera.model}, {capture.split(name)}"
+            for name, camera in capture.cameras.items()
+        },
+        "frames": f"{capture.frame_count} from frame {capture.frame_start} at {capture.fps:g} fps",
+        "pictures": len(capture.images),
+        "depth maps": len(capture.depths),
+        "frames with seed points": len(capture.seeds),
+        "bytes on disk": sum(file.stat().st_size for file in capture.images.values()),
+        "problems": problems,
+    }
+
+
+def table(facts: dict[str, Any]) -> str:
+    """Return facts as lines of text."""
+    width = max(map(len, facts))
+    lines = []
+    for name, value in facts.items():
+        for index, text in enumerate(_lines(name, value)):
+            lines.append(f"{name if index == 0 else '':{width}}  {text}")
+    return "\n".join(lines)
+
+
+def _lines(name: str, value: Any) -> list[str]:
+    if isinstance(value, dict):
+        return [f"{key}: {text}" for key, text in value.items()] or ["none"]
+    if isinstance(value, list) and value and isinstance(value[0], str):
+        return value
+    if isinstance(value, list | tuple):
+        return ["  ".join(_text(part) for part in value)] if value else ["none found"]
+    if name.startswith("bytes"):
+        return [f"{value:,} ({value / 2**20:.1f} MiB)"]
+    return [_text(value)]
+
+
+def _text(value: Any) -> str:
+    if value is None:
+        return "unknown"
+    if isinstance(value, list | tuple):
+        return f"({', '.join(_text(part) for part in value)})"
+    if isinstance(value, float):
+        return f"{value:.4g}"
+    return f"{value:,}" if isinstance(value, int) else str(value)

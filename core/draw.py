@@ -1,0 +1,99 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Draw a reel, PLY or .splatv as a camera sees it at a frame: from a file to a picture in numpy."""
+
+from functools import lru_cache
+from pathlib import Path
+from types import ModuleType
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from .camera import Camera
+from .capture import Capture
+from .errors import HoloreelError
+from .gaussians.model import SpacetimeGaussians
+from .reel import Loaded, Triple, load_gaussians
+from .render import get_backend
+from .render.contract import SpacetimeTensors
+
+
+class Drawing(NamedTuple):
+    """One picture: display-referred `image` (H, W, 3) over the background, `alpha` (H, W), `depth` (H, W).
+
+    `depth` is the alpha-weighted mean of camera-space z, 0 where nothing is.
+    """
+
+    image: NDArray[np.float32]
+    alpha: NDArray[np.float32]
+    depth: NDArray[np.float32]
+
+
+def draw(
+    gaussians: SpacetimeTensors, time: float, camera: Camera, backend: ModuleType, background: Triple = (0.0, 0.0, 0.0)
+) -> Drawing:
+    """Draw Gaussians at a normalized time; `backend` as `core.render.get_backend` returns it."""
+    with torch.no_grad():
+        rendering = backend.rasterize_spacetime(gaussians, time, camera, torch.tensor(background))
+    return Drawing(*(part.numpy() for part in rendering))
+
+
+def to_tensors(gaussians: SpacetimeGaussians) -> SpacetimeTensors:
+    """Return the parameters as tensors that can be drawn: of a full model, the base color alone."""
+    arrays = {name: getattr(gaussians, name) for name in SpacetimeTensors._fields}
+    arrays["features"] = np.ascontiguousarray(arrays["features"][:, :3])
+    return SpacetimeTensors(**{name: torch.from_numpy(array) for name, array in arrays.items()})
+
+
+class Player:
+    """Draws the frames of one file, one segment in memory at a time.
+
+    Frames are those of the timeline, sub-frames allowed: `frame_start` to `frame_start + frame_count - 1`.
+    """
+
+    def __init__(self, path: str | Path, backend: str = "auto"):
+        self.path = Path(path)
+        self.backend = get_backend(backend)
+        self.first: Loaded = load_gaussians(self.path)
+        self.report = self.first.report
+        whole = self.first.reel or self.first
+        self.frame_start, self.frame_count = whole.frame_start, whole.frame_count
+        self._tensors = lru_cache(maxsize=1)(self._load)
+
+    def frame_at(self, time: float) -> float:
+        """Return the frame at a normalized time of the whole file: 0 is the first one, 1 is just after the last."""
+        return self.frame_start + time * self.frame_count
+
+    def frames_of(self, capture: Capture) -> list[float]:
+        """Return the frame to draw for each frame of a capture.
+
+        A reel is matched by frame number; a bare PLY or .splatv, which knows no numbers, by normalized time. Raises
+        `HoloreelError` where the reel does not cover the capture: it was made from another one.
+        """
+        if self.first.reel is None:
+            return [self.frame_at(time) for time in capture.times]
+        first, last = self.frame_start, self.frame_start + self.frame_count - 1
+        start, end = capture.frame_start, capture.frame_start + capture.frame_count - 1
+        if start < first or end > last:
+            raise HoloreelError(
+                f"{self.path} holds frames {first} to {last}, {capture.source} frames {start} to {end}: "
+                "give the capture that the reel was trained on."
+            )
+        return [float(frame) for frame in range(start, end + 1)]
+
+    def draw(self, camera: Camera, frame: float, background: Triple | None = None) -> Drawing:
+        """Draw one frame, over the reel's own background unless another is given."""
+        reel = self.first.reel
+        segment, time = reel.locate(frame) if reel else (0, self.first.time_of(frame))
+        return draw(
+            self._tensors(segment),
+            time,
+            camera,
+            self.backend,
+            self.first.background if background is None else background,
+        )
+
+    def _load(self, segment: int) -> SpacetimeTensors:
+        loaded = self.first if segment == 0 else load_gaussians(self.path, segment)
+        return to_tensors(loaded.gaussians)
