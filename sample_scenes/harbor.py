@@ -16,7 +16,7 @@ from holoreel.sample_scenes import kit
 
 FRAMES = 48
 SEED = 7
-TARGET = (0.0, 0.0, 0.72)
+TARGET = (0.0, 0.0, 0.78)
 CAMERA = {"distance": 7.0, "down_deg": 10.5, "lens": 42.0}
 TRAY_RADIUS = 2.15
 SEA_LEVEL = 0.2
@@ -90,11 +90,11 @@ def paint_table(size: int = 768) -> np.ndarray:
     x, y = np.meshgrid(np.linspace(-1, 1, size), np.linspace(1, -1, size))
     radius, angle = np.hypot(x, y), np.arctan2(y, x)
     noise = soft_noise(np.random.default_rng(SEED + 1), x * 5, y * 5)
-    table = blend([(0.0, "#c98f6a"), (1.0, "#dca97f")], radius + 0.1 * noise)
+    table = blend([(0.0, "#d3ab8c"), (1.0, "#e2c3a0")], radius + 0.1 * noise)
     rays = np.clip(6 * np.sin(16 * angle), -1, 1) * (radius > 0.5)
     ring = ((radius > 0.525) & (radius < 0.545)) | ((radius > 0.64) & (radius < 0.65))
     shade = 1 + 0.045 * rays * (radius < 0.64) - 0.03 * rays * (radius >= 0.65) + 0.02 * noise
-    return np.where(ring[..., None], blend([(0.0, "#f3dfba")], radius), table * shade[..., None])
+    return np.where(ring[..., None], blend([(0.0, "#f6e8cd")], radius), table * shade[..., None])
 
 
 def build_backdrop(paints: Paints) -> None:
@@ -138,8 +138,10 @@ def build_clouds(paints: Paints) -> None:
 
 def build_sea(paints: Paints) -> None:
     """A wooden tray and slices of sea whose crests travel, left and right by turns."""
-    rim = [(2.18, 0.0), (2.42, 0.0), (2.46, 0.06), (2.44, 0.2), (2.38, 0.25), (2.24, 0.25), (2.18, 0.2), (2.18, 0.02)]
-    kit.lathe("Tray", rim, [paints["wood"]], segments=96)
+    rim = [(0.0, 0.13), (2.17, 0.13), (2.17, 0.22), (2.4, 0.22), (2.43, 0.0)]
+    inside_first = ("pine", "pine", "wood", "cream")
+    paint_of = [paints[key] for key in inside_first]
+    kit.lathe("Tray", rim, paint_of, segments=96, slot=lambda ring, _: ring, smooth=False, bevel=0.03)
     edges = np.linspace(TRAY_RADIUS, -TRAY_RADIUS, SLICES + 1)
     for number, (back, front) in enumerate(zip(edges[:-1], edges[1:], strict=True)):
         depth = 1 - number / (SLICES - 1)

@@ -38,7 +38,7 @@ def paint(name: str, color: str, *, roughness: float = 0.8, grain: float = 0.1, 
     tree = material.node_tree
     shader = tree.nodes["Principled BSDF"]
     shader.inputs["Roughness"].default_value = roughness
-    shader.inputs["Specular IOR Level"].default_value = 0.5 if roughness < 0.5 else 0.1
+    shader.inputs["Specular IOR Level"].default_value = 0.5 if roughness < 0.5 else 0.0
     rgb = linear_rgb(color)
     material.diffuse_color = (*rgb, 1.0)
     if grain == 0.0:
@@ -277,6 +277,7 @@ def start(frames: int = 48) -> bpy.types.Scene:
     cycles.samples = 96
     cycles.use_denoising = True
     cycles.max_bounces, cycles.diffuse_bounces, cycles.glossy_bounces = 3, 2, 1
+    cycles.use_fast_gi, cycles.ao_bounces_render = True, 1
     cycles.transmission_bounces = cycles.volume_bounces = cycles.transparent_max_bounces = 0
     cycles.caustics_reflective = cycles.caustics_refractive = False
     return scene
@@ -287,6 +288,8 @@ def sky(scene: bpy.types.Scene, low: str, high: str, strength: float) -> None:
     world = bpy.data.worlds.new("Soft sky")
     scene.world = world
     world.use_nodes = True
+    world.light_settings.distance = 2.0
+    world.cycles.sampling_method = "NONE"  # so soft that aiming at its bright parts costs more than it saves
     tree = world.node_tree
     place = tree.nodes.new("ShaderNodeTexCoord")
     split = tree.nodes.new("ShaderNodeSeparateXYZ")
