@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """A training run on disk: checkpoints, resuming, and the reel it ends in."""
 
+import pickle
 import platform
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
@@ -95,7 +96,7 @@ def _resume(trainer: Trainer, path: Path) -> None:
         raise HoloreelError(f"{path}: no checkpoint to resume from; leave --resume away to start anew.")
     try:
         state = torch.load(path, weights_only=True)
-    except (OSError, RuntimeError, ValueError, EOFError) as error:
+    except (OSError, RuntimeError, ValueError, EOFError, pickle.UnpicklingError) as error:
         raise HoloreelError(f"{path}: not a readable checkpoint; delete it and train anew.") from error
     changed = _differences(state.get("config", {}), asdict(trainer.config))
     if changed:
@@ -128,6 +129,7 @@ def _write_result(trainer: Trainer, paths: RunPaths) -> None:
         frame_start=trainer.capture.frame_start,
         frame_count=trainer.capture.frame_count,
         up="Z",
+        background=trainer.config.background,
         files={"config": paths.record.name},
         provenance={"capture": _capture_name(trainer), "iterations": trainer.iteration},
     )
