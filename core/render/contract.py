@@ -10,7 +10,12 @@ differentiable with respect to every tensor argument.
     rasterize_spacetime(gaussians: SpacetimeTensors, time, camera, background=None, rules=Rules(), density=None) -> Rendering
         Spacetime Gaussians at `time` (Eqs. 6-9), evaluated and projected in one pass.
 
-`camera` is a `holoreel.core.camera.Camera` (PINHOLE); `background` a (C,) tensor or None for black.
+`camera` is a `holoreel.core.camera.Camera` (PINHOLE); `background` a (C,) tensor or None for black. C is 1 to 16.
+
+Gaussians are drawn in the order of their camera-space z, rounded to single precision; equal ones in the order of their rows.
+A row is skipped, and gets zero gradient, where a parameter is not finite (but an infinite `trbf_log_scale` means always on),
+where the opacity at `time` is under `alpha_min`, or where its 2D covariance cannot be inverted. A quaternion of zero length
+means no rotation. Renderings are of the dtype the backend works in: float32, or for `reference` that of the means.
 """
 
 from dataclasses import dataclass
@@ -26,7 +31,8 @@ class Rules:
     A pixel skips a Gaussian whose alpha is under `alpha_min`, caps alpha at `alpha_max`, and stops before the Gaussian
     that would take its transmittance under `transmittance_min`. `low_pass` (px²) is added to the diagonal of the 2D
     covariance. Gaussians nearer than `near` are skipped. `x/z` and `y/z` in the Jacobian alone are clamped to
-    `jacobian_clamp` times half the field of view's tangent.
+    `jacobian_clamp` times half the field of view's tangent. `detach_motion_time` makes `trbf_centers` learn from the
+    opacity alone, as the authors train: by default it also gets the gradient through motion and rotation.
     """
 
     alpha_max: float = 0.99
@@ -35,6 +41,7 @@ class Rules:
     low_pass: float = 0.3
     near: float = 0.2
     jacobian_clamp: float = 1.3
+    detach_motion_time: bool = False
 
 
 class SpacetimeTensors(NamedTuple):

@@ -1,0 +1,64 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Shapes and types of what the backends are given, so that a mistake is named before memory is touched."""
+
+import torch
+from torch import Tensor
+
+from .contract import DensityStats, SpacetimeTensors
+
+MAX_CHANNELS = 16
+
+
+def check_gaussians(
+    means: Tensor,
+    quats: Tensor,
+    scales: Tensor,
+    opacities: Tensor,
+    features: Tensor,
+    background: Tensor | None,
+    density: DensityStats | None,
+) -> None:
+    """Raise ValueError unless the arguments of `rasterize` have the shapes of the contract."""
+    count = len(means)
+    _check_shapes(
+        means=(means, (count, 3)),
+        quats=(quats, (count, 4)),
+        scales=(scales, (count, 3)),
+        opacities=(opacities, (count,)),
+    )
+    _check_rest(count, features, background, density)
+
+
+def check_spacetime(gaussians: SpacetimeTensors, background: Tensor | None, density: DensityStats | None) -> None:
+    """Raise ValueError unless the arguments of `rasterize_spacetime` have the shapes of the contract."""
+    g, count = gaussians, len(gaussians.means)
+    _check_shapes(
+        means=(g.means, (count, 3)),
+        motions=(g.motions, (count, 3, 3)),
+        quats=(g.quats, (count, 4)),
+        omegas=(g.omegas, (count, 4)),
+        log_scales=(g.log_scales, (count, 3)),
+        opacity_logits=(g.opacity_logits, (count,)),
+        trbf_centers=(g.trbf_centers, (count,)),
+        trbf_log_scales=(g.trbf_log_scales, (count,)),
+    )
+    _check_rest(count, g.features, background, density)
+
+
+def _check_shapes(**expected: tuple[Tensor, tuple[int, ...]]) -> None:
+    for name, (tensor, shape) in expected.items():
+        if tuple(tensor.shape) != shape:
+            raise ValueError(f"{name} has shape {tuple(tensor.shape)}, not {shape}")
+
+
+def _check_rest(count: int, features: Tensor, background: Tensor | None, density: DensityStats | None) -> None:
+    if features.ndim != 2 or len(features) != count or not 1 <= features.shape[1] <= MAX_CHANNELS:
+        raise ValueError(f"features has shape {tuple(features.shape)}, not ({count}, 1 to {MAX_CHANNELS})")
+    if background is not None:
+        _check_shapes(background=(background, (features.shape[1],)))
+    if density is not None:
+        for name, dtype in (("gradient", torch.float32), ("views", torch.int32), ("radius_px", torch.float32)):
+            tensor = getattr(density, name)
+            _check_shapes(**{f"density.{name}": (tensor, (count,))})
+            if tensor.dtype != dtype or not tensor.is_contiguous() or tensor.device.type != "cpu":
+                raise ValueError(f"density.{name} must be a contiguous {dtype} tensor on the CPU")

@@ -1,0 +1,173 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The `cpu` backend: the compiled kernels as differentiable torch functions. `contract` says what they compute."""
+
+import ctypes
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from ..camera import Camera
+from ..errors import HoloreelError
+from .checks import check_gaussians, check_spacetime
+from .contract import DensityStats, Rendering, Rules, SpacetimeTensors
+from .native import (
+    PARAMETERS,
+    CCamera,
+    CGaussians,
+    CGradients,
+    CImageGradients,
+    CImages,
+    CRules,
+    CTimings,
+    get_threads,
+    load_kernels,
+    set_lanes,
+    set_threads,
+)
+
+__all__ = ["get_threads", "load_kernels", "rasterize", "rasterize_spacetime", "set_lanes", "set_threads"]
+
+
+def rasterize(
+    means: Tensor,
+    quats: Tensor,
+    scales: Tensor,
+    opacities: Tensor,
+    features: Tensor,
+    camera: Camera,
+    background: Tensor | None = None,
+    rules: Rules | None = None,
+    density: DensityStats | None = None,
+) -> Rendering:
+    """Render 3D Gaussians; shapes and meanings as in `contract`. Everything is computed in float32 on the CPU."""
+    rules = rules or Rules()
+    check_gaussians(means, quats, scales, opacities, features, background, density)
+    job = _Job(camera, rules, None, density)
+    arrays = (means, None, quats, None, scales, opacities, features, None, None)
+    return _render(job, background, arrays)
+
+
+def rasterize_spacetime(
+    gaussians: SpacetimeTensors,
+    time: float,
+    camera: Camera,
+    background: Tensor | None = None,
+    rules: Rules | None = None,
+    density: DensityStats | None = None,
+) -> Rendering:
+    """Render Spacetime Gaussians at `time`; shapes and meanings as in `contract`. float32 on the CPU."""
+    rules = rules or Rules()
+    check_spacetime(gaussians, background, density)
+    return _render(_Job(camera, rules, float(time), density), background, tuple(gaussians))
+
+
+@dataclass
+class _Job:
+    """What a rendering depends on beside tensors. `time` is None for 3D Gaussians."""
+
+    camera: Camera
+    rules: Rules
+    time: float | None
+    density: DensityStats | None
+
+    def c_camera(self) -> CCamera:
+        camera = self.camera
+        pose = (ctypes.c_double * 12)(*camera.world_to_camera[:3].ravel().tolist())
+        return CCamera(camera.fx, camera.fy, camera.cx, camera.cy, pose, camera.width, camera.height)
+
+    def c_rules(self) -> CRules:
+        r = self.rules
+        return CRules(
+            r.alpha_max, r.alpha_min, r.transmittance_min, r.low_pass, r.near, r.jacobian_clamp, r.detach_motion_time, 0
+        )
+
+    def c_gaussians(self, arrays: tuple[Tensor | None, ...]) -> CGaussians:
+        features = arrays[PARAMETERS.index("features")]
+        assert features is not None
+        spacetime = self.time is not None
+        return CGaussians(len(features), features.shape[1], spacetime, self.time or 0.0, *map(_address, arrays))
+
+
+class _Frame:
+    """What the forward pass left in the library for the backward pass; given back when nobody needs it any more."""
+
+    def __init__(self, handle: int) -> None:
+        self.handle = handle
+        self.library = load_kernels()
+
+    def __del__(self) -> None:
+        self.library.holoreel_frame_free(self.handle)
+
+    def timings(self) -> dict[str, float]:
+        """Seconds per stage of the latest passes."""
+        timings = CTimings()
+        self.library.holoreel_frame_timings(self.handle, timings)
+        return {name: getattr(timings, name) for name, _ in CTimings._fields_}
+
+    @property
+    def intersections(self) -> int:
+        """How many pairs of a Gaussian and a tile there are."""
+        return self.library.holoreel_frame_intersections(self.handle)
+
+
+def _address(tensor: Tensor | None) -> int | None:
+    return None if tensor is None else tensor.data_ptr()
+
+
+def _plain(tensor: Tensor | None) -> Tensor | None:
+    return None if tensor is None else tensor.to("cpu", torch.float32).contiguous()
+
+
+def _render(job: _Job, background: Tensor | None, arrays: tuple[Tensor | None, ...]) -> Rendering:
+    arrays = tuple(_plain(array) for array in arrays)
+    return Rendering(*_Rasterize.apply(job, _plain(background), *arrays))
+
+
+class _Rasterize(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, job: _Job, background: Tensor | None, *arrays: Tensor | None) -> tuple[Tensor, ...]:
+        channels = arrays[PARAMETERS.index("features")].shape[1]  # type: ignore[union-attr]
+        height, width = job.camera.height, job.camera.width
+        pictures = (torch.empty(height, width, channels), torch.empty(height, width), torch.empty(height, width))
+        rest = torch.empty(height, width) if ctx.needs_input_grad[1] else None
+        images = CImages(*map(_address, (*pictures, rest, background)))
+        library = load_kernels()
+        handle = library.holoreel_forward(job.c_gaussians(arrays), job.c_camera(), job.c_rules(), images)
+        if not handle:
+            raise HoloreelError(f"The picture cannot be rendered: {library.holoreel_last_error().decode()}.")
+        ctx.frame = _Frame(handle)
+        ctx.job = job
+        ctx.set_materialize_grads(False)
+        ctx.save_for_backward(background, *pictures, rest, *arrays)
+        return pictures
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, *picture_gradients: Tensor | None) -> tuple[Tensor | None, ...]:
+        background, features, alpha, depth, rest, *arrays = ctx.saved_tensors
+        incoming = tuple(_plain(gradient) for gradient in picture_gradients)
+        outgoing = tuple(
+            torch.empty_like(array) if array is not None and needed else None
+            for array, needed in zip(arrays, ctx.needs_input_grad[2:], strict=True)
+        )
+        density = ctx.job.density
+        statistics = (density.gradient, density.views, density.radius_px) if density else (None, None, None)
+        library = load_kernels()
+        status = library.holoreel_backward(
+            ctx.frame.handle,
+            ctx.job.c_gaussians(tuple(arrays)),
+            ctx.job.c_camera(),
+            ctx.job.c_rules(),
+            CImages(*map(_address, (features, alpha, depth, rest, background))),
+            CImageGradients(*map(_address, incoming)),
+            CGradients(*map(_address, outgoing), *map(_address, statistics)),
+        )
+        if status != 0:
+            raise HoloreelError(f"The gradient cannot be computed: {library.holoreel_last_error().decode()}.")
+        background_gradient = None
+        if rest is not None and incoming[0] is not None:
+            background_gradient = torch.einsum("hwc,hw->c", incoming[0].double(), rest.double()).float()
+        return None, background_gradient, *outgoing

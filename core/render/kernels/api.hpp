@@ -1,0 +1,54 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+// The plain C interface; core/render/cpu.py declares the same structures to ctypes. Raise HOLOREEL_ABI with every change.
+#pragma once
+
+#include <cstdint>
+
+#define HOLOREEL_ABI 3
+#define HOLOREEL_API extern "C" __attribute__((visibility("default")))
+
+struct HoloreelCamera {
+    double fx, fy, cx, cy;
+    double world_to_camera[12];  // the upper 3 x 4, row by row
+    int32_t width, height;
+};
+
+struct HoloreelRules {
+    double alpha_max, alpha_min, transmittance_min, low_pass, near_plane, jacobian_clamp;
+    int32_t detach_motion_time;
+    int32_t unused;
+};
+
+// N rows in each array. With `spacetime` the parameters are raw (Eqs. 6-9); without it `scales` are linear, `opacities` lie
+// in [0, 1], and motions, omegas, trbf_centers, trbf_log_scales and time are ignored.
+struct HoloreelGaussians {
+    int64_t count;
+    int32_t channels;
+    int32_t spacetime;
+    double time;
+    const float *means, *motions, *quats, *omegas, *scales, *opacities, *features, *trbf_centers, *trbf_log_scales;
+};
+
+// features (H, W, C), alpha (H, W), background (C) or null for black; depth and transmittance (H, W) or null. Transmittance
+// is 1 - alpha without the rounding, which matters where little is left of it.
+struct HoloreelImages {
+    float *features, *alpha, *depth, *transmittance;
+    const float* background;
+};
+
+// Gradients of the images; any may be null.
+struct HoloreelImageGradients {
+    const float *features, *alpha, *depth;
+};
+
+// Gradients of the Gaussians' arrays, overwritten; any may be null. The density arrays are added to, where not null.
+struct HoloreelGradients {
+    float *means, *motions, *quats, *omegas, *scales, *opacities, *features, *trbf_centers, *trbf_log_scales;
+    float* density_gradient;
+    int32_t* density_views;
+    float* density_radius_px;
+};
+
+struct HoloreelTimings {  // seconds
+    double project, sort, bin, blend, backward_blend, backward_gather;
+};

@@ -1,0 +1,93 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+// The second half of the backward pass: each Gaussian sums what its tiles left, in a fixed order and in double, and carries
+// it back through projection and evaluation to its raw parameters.
+#include <algorithm>
+#include <cmath>
+
+#include "frame.hpp"
+#include "projection.hpp"
+#include "thread_pool.hpp"
+
+namespace holoreel {
+
+namespace {
+
+constexpr double kLog2E = 1.4426950408889634;
+
+void fill_zero(float* target, int64_t i, int width) {
+    if (target) std::fill_n(target + i * width, width, 0.0f);
+}
+
+void clear_row(const HoloreelGradients& out, int64_t i, int channels) {
+    fill_zero(out.means, i, 3);
+    fill_zero(out.motions, i, 9);
+    fill_zero(out.quats, i, 4);
+    fill_zero(out.omegas, i, 4);
+    fill_zero(out.scales, i, 3);
+    fill_zero(out.opacities, i, 1);
+    fill_zero(out.features, i, channels);
+    fill_zero(out.trbf_centers, i, 1);
+    fill_zero(out.trbf_log_scales, i, 1);
+}
+
+// From the tile sums to the splat: with f = -|w|²/2 and w = W d, df/dmean = Wᵀw and df/dcov = ½ Wᵀ w wᵀ W.
+SplatGradient splat_gradient(const Splat& s, const double* sums) {
+    const double unscale = std::sqrt(2.0 / kLog2E);  // the tiles' u, v are W d times sqrt(log2(e) / 2)
+    const double u = sums[1] * unscale, v = sums[2] * unscale;
+    const double uu = sums[3] * 2.0 / kLog2E, uv = sums[4] * 2.0 / kLog2E, vv = sums[5] * 2.0 / kLog2E;
+    SplatGradient d;
+    d.x = s.w11 * u;
+    d.y = s.w12 * u + s.w22 * v;
+    d.cov_xx = 0.5 * s.w11 * s.w11 * uu;
+    d.cov_xy = 0.5 * s.w11 * (s.w12 * uu + s.w22 * uv);
+    d.cov_yy = 0.5 * (s.w12 * s.w12 * uu + 2.0 * s.w12 * s.w22 * uv + s.w22 * s.w22 * vv);
+    d.depth = 0.0;
+    return d;
+}
+
+void update_density(const HoloreelGradients& out, int64_t i, const Splat& s, const SplatGradient& d) {
+    if (out.density_gradient) out.density_gradient[i] += static_cast<float>(std::hypot(d.x, d.y));
+    if (out.density_views) out.density_views[i]++;
+    if (out.density_radius_px) {
+        const double middle = 0.5 * (s.cov_xx + s.cov_yy), half = 0.5 * (s.cov_xx - s.cov_yy);
+        const double longest = middle + std::sqrt(half * half + s.cov_xy * s.cov_xy);
+        out.density_radius_px[i] = std::max(out.density_radius_px[i], static_cast<float>(3.0 * std::sqrt(longest)));
+    }
+}
+
+}  // namespace
+
+void gather_gradients(const HoloreelGaussians& g, const HoloreelCamera& camera, const HoloreelRules& rules,
+                      const Frame& frame, const float* sums, bool with_depth, const HoloreelGradients& out) {
+    const View view(camera, rules);
+    const int padded = frame.padded_channels, width = kMoments + padded + (with_depth ? 1 : 0);
+    pool().run(frame.chunks(), [&](int64_t chunk) {
+        const int64_t end = std::min((chunk + 1) * kChunk, frame.count);
+        for (int64_t i = chunk * kChunk; i < end; i++) {
+            const Footprint& footprint = frame.footprints[i];
+            Instant instant;
+            Splat splat;
+            // The second test always holds for what the forward pass saw, unless the arrays were changed in between.
+            if (!footprint.tiles || !evaluate(g, i, rules, instant) || !project(instant, view, rules, splat)) {
+                clear_row(out, i, frame.channels);
+                continue;
+            }
+            double total[kMoments + kMaxChannels + 1] = {};
+            const float* place = sums + static_cast<int64_t>(footprint.slot) * width;
+            for (uint32_t tile = 0; tile < footprint.tiles; tile++, place += width)
+                for (int k = 0; k < width; k++) total[k] += place[k];
+            SplatGradient d_splat = splat_gradient(splat, total);
+            if (with_depth) d_splat.depth = total[kMoments + padded];
+            InstantGradient d_instant;
+            project_backward(instant, view, d_splat, d_instant);
+            d_instant.opacity = total[0] / instant.opacity;
+            evaluate_backward(g, i, rules, instant, d_instant, out);
+            if (out.features)
+                for (int c = 0; c < frame.channels; c++)
+                    out.features[i * frame.channels + c] = static_cast<float>(total[kMoments + c]);
+            update_density(out, i, splat, d_splat);
+        }
+    });
+}
+
+}  // namespace holoreel

@@ -1,0 +1,71 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+// What the tile kernels need, as plain data: their translation units are compiled for a newer instruction set than the rest,
+// so nothing here may bring inline library code with it that the linker could pick for everyone.
+#pragma once
+
+#include <stdint.h>
+
+namespace holoreel {
+
+constexpr int kTile = 16;
+constexpr int kMaxChannels = 16;
+
+// One Gaussian as the tile kernels read it, followed by its padded channels and its depth. W is scaled so that
+// log2(alpha) = log2_opacity - |W d|². The mean and W stay in double: the offset to a tile's own origin is taken in double
+// once per tile, after which everything per pixel is small and single precision is enough.
+struct Record {
+    double x, y, w11, w12, w22;
+    float log2_opacity;
+    uint32_t radii;  // half extents in x (upper 16 bits) and y (lower), as bfloat16 rounded up
+
+    const float* channels() const { return reinterpret_cast<const float*>(this + 1); }
+    float* channels() { return reinterpret_cast<float*>(this + 1); }
+};
+static_assert(sizeof(Record) == 48, "three channels and depth fill one cache line");
+
+// A Gaussian in a tile's list, and where its sums of this tile go in the backward pass.
+struct Entry {
+    uint32_t gaussian, slot;
+};
+
+struct TileJob {
+    const float* records;
+    int record_stride;  // floats
+    const Entry* entries;
+    const int64_t* tile_begin;
+    int tiles_x, width, height, channels;
+    float log2_alpha_min, alpha_max, transmittance_min;
+    const float* background;               // or null
+    float *features, *alpha, *depth, *transmittance;       // pictures; the last two may be null
+    const float *grad_features, *grad_alpha, *grad_depth;  // may be null
+    float* sums;                           // backward: (slots, sums_width)
+};
+
+// Sums per Gaussian and tile, with g = dL/d(ln alpha) and (u, v) = the scaled W d:
+// g, g u, g v, g u², g u v, g v², then dL/d(channel) of each padded channel, then dL/d(depth) if asked for.
+constexpr int kMoments = 6;
+
+using TileKernel = void (*)(const TileJob&, int tile);
+
+struct RasterKernels {
+    int lanes;
+    TileKernel (*forward)(int padded_channels, bool with_depth);
+    TileKernel (*backward)(int padded_channels, bool with_depth);
+};
+
+// The channel counts the kernels are compiled for; others are padded up.
+constexpr int kPaddedChannels[] = {1, 3, 4, 9, 16};
+
+constexpr int padded_channels(int channels) {
+    for (int padded : kPaddedChannels)
+        if (channels <= padded) return padded;
+    return 0;
+}
+
+// Floats per record: whole 32-byte pieces.
+constexpr int record_stride(int padded) { return (static_cast<int>(sizeof(Record)) / 4 + padded + 1 + 7) / 8 * 8; }
+
+const RasterKernels* narrow_kernels();  // 4 lanes: SSE4.1, NEON, or whatever the compiler makes of vectors
+const RasterKernels* wide_kernels();    // 8 lanes: AVX2 and FMA; null where not compiled
+
+}  // namespace holoreel

@@ -1,0 +1,71 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+// One tile of the picture, front to back. Included by the translation units of both widths.
+#pragma once
+
+#include "raster_tile.hpp"
+
+namespace holoreel {
+namespace HOLOREEL_NAMESPACE {
+
+template <int C, bool kDepth>
+void forward_tile(const TileJob& job, int tile) {
+    constexpr int kSums = C + (kDepth ? 2 : 0);  // with depth: the sums of w z and of w
+    const Tile t(job, tile);
+    F transmittance[kVectors];
+    F sums[kVectors][kSums];
+    for (int k = 0; k < t.rows * kGroups; k++) {
+        transmittance[k] = t.inside(k, set1(1.0f));
+        for (int c = 0; c < kSums; c++) sums[k][c] = set1(0.0f);
+    }
+    const F transmittance_min = set1(job.transmittance_min), alpha_max = set1(job.alpha_max);
+    const F log2_alpha_min = set1(job.log2_alpha_min);
+
+    int until_check = kCheckEvery;
+    for (int64_t e = t.begin; e < t.end; e++) {
+        prefetch_record<C>(job, e + kPrefetch < t.end ? e + kPrefetch : t.end - 1);
+        const Record& record = record_at<C>(job, e);
+        const Touched touched(record, t);
+        F channels[C + 1];
+        for (int c = 0; c < C + (kDepth ? 1 : 0); c++) channels[c] = set1(record.channels()[c]);
+        for (int group = touched.group_begin; group < touched.group_end; group++) {
+            Falloff falloff(record, t, group, touched.row_begin);
+            for (int row = touched.row_begin; row < touched.row_end; row++, falloff.next_row()) {
+                const int k = row * kGroups + group;
+                const F before = transmittance[k];
+                const F p = falloff.log2_alpha();
+                const Mask seen = both(ge(p, log2_alpha_min), gt(before, set1(0.0f)));
+                const F alpha = min(exp2(p), alpha_max);
+                const F after = fnma(alpha, before, before);
+                const Mask drawn = both(seen, ge(after, transmittance_min));
+                const F weight = keep(drawn, mul(alpha, before));
+                transmittance[k] = select(drawn, after, select(seen, negate(before), before));
+                F* sum = sums[k];
+                for (int c = 0; c < C + (kDepth ? 1 : 0); c++) sum[c] = fma(weight, channels[c], sum[c]);
+                if (kDepth) sum[C + 1] = add(sum[C + 1], weight);
+            }
+        }
+        if (--until_check == 0) {
+            if (!any_live(transmittance, t.rows * kGroups)) break;
+            until_check = kCheckEvery;
+        }
+    }
+
+    for (int k = 0; k < t.rows * kGroups; k++) {
+        float rest[kLanes], values[kSums][kLanes];
+        store(rest, abs(transmittance[k]));
+        for (int c = 0; c < kSums; c++) store(values[c], sums[k][c]);
+        const int64_t first = t.pixel(k);
+        for (int lane = 0, lanes = t.lanes_inside(k); lane < lanes; lane++) {
+            float* features = job.features + (first + lane) * job.channels;
+            for (int c = 0; c < job.channels; c++)
+                features[c] = values[c][lane] + (job.background ? rest[lane] * job.background[c] : 0.0f);
+            const float covered = kDepth ? values[kSums - 1][lane] : 1.0f - rest[lane];
+            job.alpha[first + lane] = covered;
+            if (job.transmittance) job.transmittance[first + lane] = rest[lane];
+            if (kDepth) job.depth[first + lane] = covered > 0.0f ? values[C][lane] / covered : 0.0f;
+        }
+    }
+}
+
+}  // namespace HOLOREEL_NAMESPACE
+}  // namespace holoreel

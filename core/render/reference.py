@@ -1,0 +1,292 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The `reference` backend: the contract in plain vectorized torch, in float32 or float64, differentiated by autograd.
+
+It is the oracle of the other backends and what runs where nothing was compiled. It works tile by tile like they do: the
+tiles are taken in groups of about equal length, padded, and composited by a cumulative product.
+"""
+
+import math
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+from torch.utils.checkpoint import checkpoint
+
+from ..camera import Camera
+from .checks import check_gaussians, check_spacetime
+from .contract import DensityStats, Rendering, Rules, SpacetimeTensors
+
+TILE = 16
+GROUP_ELEMENTS = 3_000_000  # of (Gaussian, pixel) pairs composited at once
+GRAPH_ELEMENTS = 150_000_000  # beyond this many in a picture, groups are computed again in the backward pass
+MIN_LOG_WIDTH = -40.0  # narrower than any time step; keeps 1 / width² finite
+MIN_QUAT_NORM = 1e-12  # under this a quaternion means no rotation
+
+
+class Gaussians3D(NamedTuple):
+    """3D Gaussians in the world: what `rasterize` takes."""
+
+    means: Tensor
+    quats: Tensor
+    scales: Tensor
+    opacities: Tensor
+    features: Tensor
+
+
+class Splats(NamedTuple):
+    """Gaussians on the image, M of them, in the order of depth."""
+
+    means: Tensor  # (M, 2) pixels
+    conics: Tensor  # (M, 3) inverse covariance: xx, xy, yy
+    covariances: Tensor  # (M, 3) xx, xy, yy, low pass included
+    depths: Tensor  # (M,)
+    opacities: Tensor  # (M,)
+    features: Tensor  # (M, C)
+    rows: Tensor  # (M,) which Gaussian each one is
+
+
+def rasterize(
+    means: Tensor,
+    quats: Tensor,
+    scales: Tensor,
+    opacities: Tensor,
+    features: Tensor,
+    camera: Camera,
+    background: Tensor | None = None,
+    rules: Rules | None = None,
+    density: DensityStats | None = None,
+) -> Rendering:
+    """Render 3D Gaussians; shapes and meanings as in `contract`."""
+    rules = rules or Rules()
+    check_gaussians(means, quats, scales, opacities, features, background, density)
+    with torch.no_grad():
+        rows = torch.nonzero(_finite(means, quats, scales, features) & (opacities >= rules.alpha_min))[:, 0]
+    gaussians = Gaussians3D(*(array[rows] for array in (means, quats, scales, opacities, features)))
+    return _render(gaussians, rows, camera, background, rules, density)
+
+
+def rasterize_spacetime(
+    gaussians: SpacetimeTensors,
+    time: float,
+    camera: Camera,
+    background: Tensor | None = None,
+    rules: Rules | None = None,
+    density: DensityStats | None = None,
+) -> Rendering:
+    """Render Spacetime Gaussians at `time`; shapes and meanings as in `contract`."""
+    rules = rules or Rules()
+    check_spacetime(gaussians, background, density)
+    g = gaussians
+    with torch.no_grad():
+        finite = _finite(g.means, g.motions, g.quats, g.omegas, g.log_scales, g.opacity_logits, g.features)
+        finite &= torch.isfinite(g.trbf_centers) & ~torch.isnan(g.trbf_log_scales)
+        rows = torch.nonzero(finite)[:, 0]
+        opacities = _opacities(g.opacity_logits[rows], time - g.trbf_centers[rows], g.trbf_log_scales[rows])
+        rows = rows[opacities >= rules.alpha_min]
+    seen = SpacetimeTensors(*(array[rows] for array in g))
+    return _render(evaluate(seen, time, rules), rows, camera, background, rules, density)
+
+
+def evaluate(g: SpacetimeTensors, time: float, rules: Rules | None = None) -> Gaussians3D:
+    """Return the 3D Gaussians at `time` (Spacetime Gaussians, Eqs. 6-9)."""
+    dt = time - g.trbf_centers
+    moving = (dt.detach() if rules and rules.detach_motion_time else dt)[:, None]
+    b = g.motions
+    means = g.means + moving * (b[:, 0] + moving * (b[:, 1] + moving * b[:, 2]))
+    quats = g.quats + moving * g.omegas
+    opacities = _opacities(g.opacity_logits, dt, g.trbf_log_scales)
+    return Gaussians3D(means, quats, g.log_scales.exp(), opacities, g.features)
+
+
+def _opacities(logits: Tensor, dt: Tensor, log_widths: Tensor) -> Tensor:
+    return torch.sigmoid(logits) * torch.exp(-((dt * torch.exp(-log_widths.clamp(min=MIN_LOG_WIDTH))) ** 2))
+
+
+def _finite(*arrays: Tensor) -> Tensor:
+    good = torch.ones(len(arrays[0]), dtype=torch.bool, device=arrays[0].device)
+    for array in arrays:
+        good &= torch.isfinite(array.reshape(len(array), math.prod(array.shape[1:]))).all(1)
+    return good
+
+
+def rotation_matrices(quats: Tensor) -> Tensor:
+    """Return (N, 3, 3) rotations of (N, 4) quaternions w x y z of any length; zero length gives the identity."""
+    lengths = quats.norm(dim=1, keepdim=True)
+    identity = torch.tensor([1.0, 0.0, 0.0, 0.0], dtype=quats.dtype, device=quats.device)
+    defined = lengths >= MIN_QUAT_NORM
+    safe = torch.where(defined, quats, identity)
+    w, x, y, z = (safe / safe.norm(dim=1, keepdim=True)).unbind(1)
+    rows = (
+        *(1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
+        *(2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
+        *(2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
+    )
+    return torch.stack(rows, 1).reshape(-1, 3, 3)
+
+
+def project(g: Gaussians3D, rows: Tensor, camera: Camera, rules: Rules) -> Splats:
+    """Project 3D Gaussians to the image (EWA splatting); keep those that can be drawn, in the order of depth."""
+    pose = torch.tensor(camera.world_to_camera.tolist(), dtype=g.means.dtype, device=g.means.device)
+    turn, shift = pose[:3, :3], pose[:3, 3]
+    with torch.no_grad():
+        z = g.means @ turn[2] + shift[2]
+        front = torch.nonzero((z >= rules.near) & (z > 0))[:, 0]
+    g, rows = Gaussians3D(*(array[front] for array in g)), rows[front]
+
+    x, y, z = (g.means @ turn.T + shift).unbind(1)
+    tan_x, tan_y = x / z, y / z
+    limit_x = rules.jacobian_clamp * 0.5 * camera.width / abs(camera.fx)
+    limit_y = rules.jacobian_clamp * 0.5 * camera.height / abs(camera.fy)
+    zero = torch.zeros_like(z)
+    jacobian = torch.stack(
+        (
+            *(camera.fx / z, zero, -camera.fx * tan_x.clamp(-limit_x, limit_x) / z),
+            *(zero, camera.fy / z, -camera.fy * tan_y.clamp(-limit_y, limit_y) / z),
+        ),
+        1,
+    ).reshape(-1, 2, 3)
+    spread = jacobian @ turn @ (rotation_matrices(g.quats) * g.scales[:, None, :])
+    blur = rules.low_pass * torch.eye(2, dtype=z.dtype, device=z.device)
+    covariance = spread @ spread.transpose(1, 2) + blur
+    xx, xy, yy = covariance[:, 0, 0], covariance[:, 0, 1], covariance[:, 1, 1]
+    determinant = xx * yy - xy * xy
+    conics = torch.stack((yy, -xy, xx), 1) / determinant[:, None]
+    means = torch.stack((camera.fx * tan_x + camera.cx, camera.fy * tan_y + camera.cy), 1)
+    with torch.no_grad():
+        good = (determinant > 0) & torch.isfinite(determinant) & _finite(means, conics)
+        keep = torch.nonzero(good)[:, 0]
+        keep = keep[torch.argsort(z[keep].to(torch.float32), stable=True)]
+    arrays = (means, conics, torch.stack((xx, xy, yy), 1), z, g.opacities, g.features, rows)
+    return Splats(*(array[keep] for array in arrays))
+
+
+def bin_to_tiles(splats: Splats, width: int, height: int, rules: Rules) -> tuple[Tensor, Tensor]:
+    """Return (tiles + 1,) offsets and the list of splats of each tile, front to back."""
+    columns, tiles = -(-width // TILE), -(-width // TILE) * -(-height // TILE)
+    with torch.no_grad():
+        reach = 2 * torch.log(splats.opacities / rules.alpha_min)
+        radii = torch.sqrt(reach[:, None].clamp(min=0) * splats.covariances[:, [0, 2]]) + 1e-3
+        size = torch.tensor([width, height], dtype=radii.dtype, device=radii.device)
+        first = torch.ceil(splats.means - radii - 0.5).clamp(min=0)
+        last = torch.minimum(torch.floor(splats.means + radii - 0.5), size - 1)
+        seen = (first <= last).all(1)
+        first = torch.where(seen[:, None], first, 0).long() // TILE
+        spans = torch.where(seen[:, None], torch.where(seen[:, None], last, 0).long() // TILE + 1 - first, 0)
+        counts = spans.prod(1)
+        splat = torch.repeat_interleave(torch.arange(len(counts), device=counts.device), counts)
+        place = torch.arange(len(splat), device=counts.device) - (counts.cumsum(0) - counts)[splat]
+        across = spans[splat, 0]
+        tile = (first[splat, 1] + place // across) * columns + first[splat, 0] + place % across
+        order = torch.argsort(tile, stable=True)
+        offsets = torch.zeros(tiles + 1, dtype=torch.long, device=tile.device)
+        offsets[1:] = torch.bincount(tile, minlength=tiles).cumsum(0)
+        return offsets, splat[order]
+
+
+def _groups(lengths: Tensor) -> Iterator[Tensor]:
+    """Tiles that hold anything, in groups of about equal length, each small enough to composite at once."""
+    order = torch.argsort(lengths)
+    order = order[lengths[order] > 0]
+    start = 0
+    sizes = lengths[order].tolist()
+    while start < len(sizes):
+        end = start + 1
+        while end < len(sizes) and (end + 1 - start) * sizes[end] * TILE * TILE <= GROUP_ELEMENTS:
+            end += 1
+        yield order[start:end]
+        start = end
+
+
+def _composite(
+    means: Tensor,
+    conics: Tensor,
+    opacities: Tensor,
+    values: Tensor,
+    chosen: Tensor,
+    valid: Tensor,
+    origins: Tensor,
+    rules: Rules,
+) -> Tensor:
+    """Return (tiles, pixels, channels + 1): the weighted sums of `values`, and the sum of the weights.
+
+    `chosen` (tiles, K) are splats front to back, `valid` says which of them are real, `origins` (tiles, 2) in pixels.
+    """
+    line = torch.arange(TILE, device=chosen.device) + 0.5
+    x = origins[:, 0, None, None] + line.repeat(TILE)
+    y = origins[:, 1, None, None] + line.repeat_interleave(TILE)
+    mean, conic = means[chosen], conics[chosen]
+    dx, dy = x - mean[..., 0:1], y - mean[..., 1:2]
+    power = -0.5 * (conic[..., 0:1] * dx * dx + conic[..., 2:3] * dy * dy) - conic[..., 1:2] * dx * dy
+    alpha = (opacities[chosen][..., None] * torch.exp(power)).clamp(max=rules.alpha_max)
+    alpha = torch.where((alpha >= rules.alpha_min) & valid[..., None], alpha, 0)
+    after = torch.cumprod(1 - alpha, 1)
+    before = torch.cat((torch.ones_like(after[:, :1]), after[:, :-1]), 1)
+    # Once a Gaussian would take the transmittance under the limit, all later ones would too: the pixel is full.
+    weights = torch.where(after >= rules.transmittance_min, alpha * before, 0)
+    return torch.cat((torch.einsum("tkp,tkc->tpc", weights, values[chosen]), weights.sum(1)[..., None]), 2)
+
+
+def composite(splats: Splats, width: int, height: int, rules: Rules) -> Tensor:
+    """Return (H, W, C + 2): the sums of w feature, of w z, and of w over the Gaussians of each pixel."""
+    columns, rows = -(-width // TILE), -(-height // TILE)
+    offsets, lists = bin_to_tiles(splats, width, height, rules)
+    lengths = offsets[1:] - offsets[:-1]
+    values = torch.cat((splats.features, splats.depths[:, None]), 1)
+    inputs = (splats.means, splats.conics, splats.opacities, values)
+    recompute = torch.is_grad_enabled() and int(lengths.sum()) * TILE * TILE > GRAPH_ELEMENTS
+    parts, places = [values.new_zeros(0, TILE * TILE, values.shape[1] + 1)], [lengths[:0]]
+    for tiles in _groups(lengths):
+        place = torch.arange(int(lengths[tiles].max()), device=tiles.device)
+        valid = place < lengths[tiles][:, None]
+        chosen = lists[torch.where(valid, offsets[tiles][:, None] + place, 0)]
+        origins = torch.stack((tiles % columns, tiles // columns), 1) * TILE
+        if recompute:
+            part = checkpoint(_composite, *inputs, chosen, valid, origins, rules, use_reentrant=False)
+        else:
+            part = _composite(*inputs, chosen, valid, origins, rules)
+        parts.append(part)
+        places.append(tiles)
+    picture = values.new_zeros(rows * columns, TILE * TILE, values.shape[1] + 1)
+    picture = picture.index_copy(0, torch.cat(places), torch.cat(parts))
+    picture = picture.reshape(rows, columns, TILE, TILE, -1).transpose(1, 2).reshape(rows * TILE, columns * TILE, -1)
+    return picture[:height, :width]
+
+
+def _render(
+    gaussians: Gaussians3D,
+    rows: Tensor,
+    camera: Camera,
+    background: Tensor | None,
+    rules: Rules,
+    density: DensityStats | None,
+) -> Rendering:
+    splats = project(gaussians, rows, camera, rules)
+    if density is not None:
+        _watch_density(splats, camera, rules, density)
+    sums = composite(splats, camera.width, camera.height, rules)
+    features, weighted_z, alpha = sums[..., :-2], sums[..., -2], sums[..., -1]
+    if background is not None:
+        features = features + (1 - alpha)[..., None] * background.to(features.dtype)
+    covered = alpha > 0
+    depth = torch.where(covered, weighted_z / torch.where(covered, alpha, 1), 0)
+    return Rendering(features, alpha, depth)
+
+
+def _watch_density(splats: Splats, camera: Camera, rules: Rules, density: DensityStats) -> None:
+    """Let the backward pass add to `density`."""
+    if not splats.means.requires_grad:
+        return
+    offsets, lists = bin_to_tiles(splats, camera.width, camera.height, rules)
+    seen = torch.zeros(len(splats.rows), dtype=torch.bool, device=lists.device)
+    seen[lists] = True
+    rows, (xx, xy, yy) = splats.rows[seen], splats.covariances.detach()[seen].unbind(1)
+    longest = 0.5 * (xx + yy) + torch.sqrt((0.5 * (xx - yy)) ** 2 + xy**2)
+    radii = (3 * longest.sqrt()).to(density.radius_px.dtype)
+
+    def add(gradient: Tensor) -> None:
+        density.gradient[rows] += gradient[seen].norm(dim=1).to(density.gradient.dtype)
+        density.views[rows] += 1
+        density.radius_px[rows] = torch.maximum(density.radius_px[rows], radii)
+
+    splats.means.register_hook(add)
