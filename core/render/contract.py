@@ -4,18 +4,21 @@
 Each backend module has the two functions `rasterize` and `rasterize_spacetime` with the signatures below; both are
 differentiable with respect to every tensor argument.
 
-    rasterize(means, quats, scales, opacities, features, camera, background=None, rules=Rules(), density=None) -> Rendering
+    rasterize(means, quats, scales, opacities, features, camera, background=None, rules=None, density=None)
+        -> Rendering
         3D Gaussians: means (N,3), quats (N,4) wxyz unnormalized, scales (N,3) linear, opacities (N,) in [0,1],
         features (N,C).
-    rasterize_spacetime(gaussians: SpacetimeTensors, time, camera, background=None, rules=Rules(), density=None) -> Rendering
+    rasterize_spacetime(gaussians: SpacetimeTensors, time, camera, background=None, rules=None, density=None)
+        -> Rendering
         Spacetime Gaussians at `time` (Eqs. 6-9), evaluated and projected in one pass.
 
-`camera` is a `holoreel.core.camera.Camera` (PINHOLE); `background` a (C,) tensor or None for black. C is 1 to 16.
+`camera` is a `holoreel.core.camera.Camera` (PINHOLE); `background` a (C,) tensor or None for black; `rules` None for
+`Rules()`. C is 1 to 16.
 
-Gaussians are drawn in the order of their camera-space z, rounded to single precision; equal ones in the order of their rows.
-A row is skipped, and gets zero gradient, where a parameter is not finite (but an infinite `trbf_log_scale` means always on),
-where the opacity at `time` is under `alpha_min`, or where its 2D covariance cannot be inverted. A quaternion of zero length
-means no rotation. Renderings are of the dtype the backend works in: float32, or for `reference` that of the means.
+Gaussians are drawn in the order of their camera-space z, rounded to single precision; equal ones in the order of their
+rows. A row is skipped, and gets zero gradient, where a parameter is not finite (but an infinite `trbf_log_scale` means
+always on), where the opacity at `time` is under `alpha_min`, or where its 2D covariance cannot be inverted. A quaternion
+of zero length means no rotation. Renderings are float32, or for `reference` of the dtype of the means.
 """
 
 from dataclasses import dataclass

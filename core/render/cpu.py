@@ -15,6 +15,7 @@ from .checks import check_gaussians, check_spacetime
 from .contract import DensityStats, Rendering, Rules, SpacetimeTensors
 from .native import (
     PARAMETERS,
+    TIMINGS,
     CCamera,
     CGaussians,
     CGradients,
@@ -105,7 +106,7 @@ class _Frame:
         """Seconds per stage of the latest passes."""
         timings = CTimings()
         self.library.holoreel_frame_timings(self.handle, timings)
-        return {name: getattr(timings, name) for name, _ in CTimings._fields_}
+        return {name: getattr(timings, name) for name in TIMINGS}
 
     @property
     def intersections(self) -> int:

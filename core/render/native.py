@@ -83,12 +83,13 @@ class CGradients(Structure):
     )
 
 
+TIMINGS = ("project", "sort", "bin", "blend", "backward_blend", "backward_gather")
+
+
 class CTimings(Structure):
     """`HoloreelTimings`, in seconds."""
 
-    _fields_ = tuple(
-        (name, c_double) for name in ("project", "sort", "bin", "blend", "backward_blend", "backward_gather")
-    )
+    _fields_ = tuple((name, c_double) for name in TIMINGS)
 
 
 _SIGNATURES = {
@@ -118,7 +119,7 @@ _SIGNATURES = {
 
 
 def library_folders() -> list[Path]:
-    """Where the library may lie: an editable install keeps it in site-packages while the sources stay in the repository."""
+    """Where the library may lie: an editable install keeps it in site-packages and the sources in the repository."""
     return [Path(folder) for folder in sys.modules[__package__].__path__]
 
 

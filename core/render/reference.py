@@ -277,7 +277,7 @@ def _watch_density(splats: Splats, camera: Camera, rules: Rules, density: Densit
     """Let the backward pass add to `density`."""
     if not splats.means.requires_grad:
         return
-    offsets, lists = bin_to_tiles(splats, camera.width, camera.height, rules)
+    _, lists = bin_to_tiles(splats, camera.width, camera.height, rules)
     seen = torch.zeros(len(splats.rows), dtype=torch.bool, device=lists.device)
     seen[lists] = True
     rows, (xx, xy, yy) = splats.rows[seen], splats.covariances.detach()[seen].unbind(1)
