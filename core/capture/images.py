@@ -39,17 +39,21 @@ def composite(picture: NDArray[np.uint8], background: tuple[float, float, float]
 
 
 def read_depth(path: Path, width: int, height: int) -> NDArray[np.float32]:
-    """Read a depth EXR of one channel as (height, width) planar z in scene units; infinity where nothing was hit."""
+    """Read the channel Z of an EXR (or its only one) as (height, width) planar z; infinity where nothing was hit.
+
+    Blender's multilayer files call it `ViewLayer.Depth.Z`, in a part of its own or together with the others.
+    """
     import OpenEXR
 
     try:
         with OpenEXR.File(str(path), separate_channels=True) as file:
-            channels = [channel.pixels for part in file.parts for channel in part.channels.values()]
+            channels = {name: channel.pixels for part in file.parts for name, channel in part.channels.items()}
     except (OSError, RuntimeError, ValueError, TypeError) as error:
         raise HoloreelError(f"{path} cannot be read as an EXR ({error}): render it again.") from error
-    if not channels:
-        raise HoloreelError(f"{path} has no channel: render it again.")
-    depth = np.array(channels[0], dtype=np.float32)
+    found = [pixels for name, pixels in channels.items() if len(channels) == 1 or name.split(".")[-1] == "Z"]
+    if len(found) != 1:
+        raise HoloreelError(f"{path} has no channel Z (it has {', '.join(channels) or 'none'}): render it again.")
+    depth = np.array(found[0], dtype=np.float32)
     _check_size(path, depth.shape, width, height)
     depth[~(depth < BACKGROUND_DEPTH)] = np.inf
     return depth

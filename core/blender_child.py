@@ -1,0 +1,45 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The other end of `core.blender`: what runs inside Blender. Knows the protocol, not Blender."""
+
+import importlib
+import json
+import os
+import sys
+import threading
+import traceback
+from typing import Any, NoReturn
+
+from .blender import MARKER
+from .errors import HoloreelError
+
+
+def serve() -> NoReturn:
+    """Read one request from standard input, call its function, say how it went, and end the process.
+
+    The process is ended without Blender's own clean-up, which can hang. It ends early when standard input closes:
+    whoever asked is gone.
+    """
+    request = json.loads(sys.stdin.readline())
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+    module, _, name = request["function"].partition(":")
+    try:
+        result = getattr(importlib.import_module(module), name)(request["job"], emit)
+        emit({"event": "done", "result": result})
+    except HoloreelError as error:
+        emit({"event": "error", "message": str(error), "mendable": True})
+    except Exception as error:  # noqa: BLE001 - everything is reported, nothing is swallowed
+        traceback.print_exc()
+        emit({"event": "error", "message": f"Blender failed with {type(error).__name__}: {error}", "mendable": False})
+    sys.stderr.flush()
+    os._exit(0)
+
+
+def emit(event: dict[str, Any]) -> None:
+    """Send one event; it has a line of its own whatever was printed before it."""
+    sys.stdout.write(f"\n{MARKER}{json.dumps(event)}\n")
+    sys.stdout.flush()
+
+
+def _end_with_parent() -> None:
+    sys.stdin.read()
+    os._exit(1)
