@@ -4,7 +4,7 @@
 from functools import lru_cache
 from pathlib import Path
 from types import ModuleType
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 import torch
@@ -17,6 +17,8 @@ from .gaussians.model import SpacetimeGaussians
 from .reel import Loaded, Triple, load_gaussians
 from .render import get_backend
 from .render.contract import SpacetimeTensors
+
+Backend = Literal["auto", "cpu", "reference"]
 
 
 class Drawing(NamedTuple):
@@ -52,7 +54,7 @@ class Player:
     Frames are those of the timeline, sub-frames allowed: `frame_start` to `frame_start + frame_count - 1`.
     """
 
-    def __init__(self, path: str | Path, backend: str = "auto"):
+    def __init__(self, path: str | Path, backend: Backend = "auto"):
         self.path = Path(path)
         self.backend = get_backend(backend)
         self.first: Loaded = load_gaussians(self.path)

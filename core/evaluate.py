@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from .capture import Capture
-from .draw import Drawing, Player
+from .draw import Backend, Drawing, Player
 from .errors import HoloreelError
 from .metrics import Scores, mean_scores, score
 
@@ -19,7 +19,7 @@ def evaluate(
     path: str | Path,
     capture: Capture,
     split: str = "test",
-    backend: str = "auto",
+    backend: Backend = "auto",
     on_progress: Callable[[int, int], None] | None = None,
     on_picture: Callable[[str, int, Drawing], None] | None = None,
 ) -> dict[str, Any]:

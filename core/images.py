@@ -35,7 +35,7 @@ def read_image(path: str | Path) -> Image:
     pixels = np.atleast_3d(pixels)
     if pixels.shape[2] <= 2:  # gray, or gray and alpha
         pixels = np.concatenate([pixels[:, :, :1]] * 3 + [pixels[:, :, 1:]], axis=2)
-    return pixels.astype(np.float32) / np.iinfo(pixels.dtype).max
+    return pixels.astype(np.float32) / np.float32(np.iinfo(pixels.dtype).max)
 
 
 def write_png(path: str | Path, image: NDArray[np.floating]) -> None:

@@ -14,7 +14,7 @@ Segments follow each other without gap. Frame j of a segment's F frames has the 
 
 from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath, PureWindowsPath
-from typing import Any
+from typing import Any, TypeGuard
 
 from .errors import HoloreelError
 from .files import read_json, write_json
@@ -308,7 +308,7 @@ def _parse_triple(path: Path, name: str, value: Any) -> Triple:
     return float(value[0]), float(value[1]), float(value[2])
 
 
-def _is_int(value: Any) -> bool:
+def _is_int(value: Any) -> TypeGuard[int]:
     return isinstance(value, int) and not isinstance(value, bool) and abs(value) < 2**31
 
 

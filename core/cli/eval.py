@@ -9,7 +9,7 @@ import tyro
 from tqdm import tqdm
 
 from ..capture import read_capture
-from ..draw import Drawing
+from ..draw import Backend, Drawing
 from ..evaluate import evaluate
 from ..files import write_json
 from ..images import picture_path, write_png
@@ -22,7 +22,7 @@ def run(
     split: Literal["test", "train", "all"] = "test",
     out: Path | None = None,
     pictures: bool = True,
-    backend: Literal["auto", "cpu", "reference"] = "auto",
+    backend: Backend = "auto",
 ) -> None:
     """Measure PSNR, SSIM, DSSIM1 and DSSIM2 per camera and frame.
 

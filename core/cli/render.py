@@ -12,7 +12,7 @@ from tqdm import tqdm
 
 from ..camera import read_camera
 from ..capture import Capture, read_capture
-from ..draw import Drawing, Player
+from ..draw import Backend, Drawing, Player
 from ..errors import HoloreelError
 from ..images import picture_path, write_image
 from ..reel import Triple
@@ -29,7 +29,7 @@ def run(
     frame: float | None = None,
     background: str | None = None,
     format: Literal["png", "exr"] = "png",
-    backend: Literal["auto", "cpu", "reference"] = "auto",
+    backend: Backend = "auto",
 ) -> None:
     """Draw a reel, PLY or .splatv: one picture of one camera, or all frames of all cameras of a capture.
 

@@ -174,7 +174,7 @@ class SpacetimeGaussians:
         _, lowest, highest = ROWS[name]
         values = self.columns(name)
         # Comparisons with NaN are false, so "not inside" catches it.
-        return ~((values >= lowest) & (values <= highest)).all(axis=1)
+        return ~np.all((values >= lowest) & (values <= highest), axis=1)
 
     def without_bad_rows(self) -> Self:
         """Return the model without its `bad_rows`; the model itself where there are none."""

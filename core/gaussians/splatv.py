@@ -10,7 +10,7 @@ the texture.
 import json
 import struct
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, TypeGuard
 
 import numpy as np
 from numpy.typing import NDArray
@@ -78,7 +78,7 @@ def _decode(records: NDArray[np.void], report: list[str]) -> SpacetimeGaussians:
         omegas=records["omega"],
         log_scales=log_scales,
         opacity_logits=logit(np.clip(rgba[:, 3], _LEAST_OPACITY, 1.0 - _LEAST_OPACITY)),
-        features=rgba[:, :3],
+        features=rgba[:, :3].astype(np.float32),
         trbf_centers=records["temporal"][:, 0],
         trbf_log_scales=log_widths,
     )
@@ -135,5 +135,5 @@ def _find_splats(path: Path, header: tuple[list[Any], int]) -> tuple[dict[str, A
     raise HoloreelError(f"{path} has no chunk of type 'splat': give a .splatv that holds Gaussians.")
 
 
-def _is_count(value: Any) -> bool:
+def _is_count(value: Any) -> TypeGuard[int]:
     return isinstance(value, int) and not isinstance(value, bool) and 0 < value < 2**48
