@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """The point attributes of a reel: one table, from Spacetime Gaussians to Blender's types.
 
-Attributes with the prefix `stg_` hold what the node group "Holoreel Evaluate" consumes; the others are there after it too.
+Attributes with the prefix `stg_` are what the node group "Holoreel Evaluate" consumes; the others are there after it.
 Quaternions travel as FLOAT_COLOR, because nodes can calculate with a color's four numbers but not with a rotation's.
 """
 

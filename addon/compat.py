@@ -81,36 +81,42 @@ def draw_input(
 
 
 def new_point_cloud(context: bpy.types.Context, name: str, count: int) -> bpy.types.Object:
-    """Return a new POINTCLOUD object with `count` points at the origin, linked to the scene's root collection.
+    """Return a new POINTCLOUD object with `count` points at the origin, linked to the context's collection.
 
     Needs Object Mode where `PointCloud.resize` is missing (4.5), because a mesh is converted there.
     """
     if hasattr(bpy.types.PointCloud, "resize"):
-        data = bpy.data.pointclouds.new(name)
-        data.resize(count)
-        created = bpy.data.objects.new(name, data)
-        context.scene.collection.objects.link(created)
+        cloud = bpy.data.pointclouds.new(name)
+        cloud.resize(count)
+        created = bpy.data.objects.new(name, cloud)
+        context.collection.objects.link(created)
         return created
     mesh = bpy.data.meshes.new(name)
     mesh.vertices.add(count)
     created = bpy.data.objects.new(name, mesh)
+    # The operator finds only what the view layer shows, which the context's collection need not be part of.
     context.scene.collection.objects.link(created)
+    context.view_layer.update()
     with context.temp_override(
         object=created, active_object=created, selected_objects=[created], selected_editable_objects=[created]
     ):
         bpy.ops.object.convert(target="POINTCLOUD")
     if mesh.users == 0:
         bpy.data.meshes.remove(mesh)
+    if context.collection != context.scene.collection:
+        context.collection.objects.link(created)
+        context.scene.collection.objects.unlink(created)
     return created
 
 
 # --- Nodes and materials --------------------------------------------------------------------------------------------
 
 
-def enable_nodes(material: bpy.types.Material) -> None:
-    """Give a new material its node tree (later versions always have one, and say that asking is deprecated)."""
-    if material.node_tree is None:
-        material.use_nodes = True
+def enable_nodes(block: bpy.types.Material | bpy.types.World) -> bpy.types.NodeTree:
+    """Return a material's or world's node tree (later versions always have one, and warn of `use_nodes`)."""
+    if block.node_tree is None:
+        block.use_nodes = True
+    return block.node_tree
 
 
 def set_wildcard(node: bpy.types.Node) -> None:

@@ -14,9 +14,9 @@ QUAD_ATTRIBUTE = "splat_uv"  # place on the quad: alpha reaches 1/255 on the uni
 
 def _new_material(name: str) -> tuple[bpy.types.Material, Tree]:
     material = bpy.data.materials.new(name)
-    enable_nodes(material)
-    material.node_tree.nodes.clear()
-    return material, Tree(material.node_tree)
+    nodes = enable_nodes(material)
+    nodes.nodes.clear()
+    return material, Tree(nodes)
 
 
 def _attribute(tree: Tree, name: str, output: str) -> bpy.types.NodeSocket:

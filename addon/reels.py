@@ -1,44 +1,125 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Reels as Blender objects."""
+"""Reels as Blender objects: a point cloud with a model's parameters, and a modifier that plays it."""
+
+import math
+from pathlib import Path
 
 import bpy
+from mathutils import Matrix
 
 from ..core.gaussians.model import SpacetimeGaussians
+from ..core.reel import Loaded, load_gaussians
 from . import attributes
 from .compat import input_path, new_point_cloud, set_input
-from .nodes import reel as reel_group
+from .nodes.library import is_tagged
+from .nodes.reel import NAME, reel
 from .timeline import Timeline
 
 MODIFIER = "Holoreel"
+INFO = "holoreel"  # custom property of a reel's object: source, kind, fps, frame_count, gaussians, report
+
+FRAME_BY_FRAME, REAL_TIME = "FRAMES", "REAL_TIME"
+
+# Quarter turns that bring the axis that points up in the file onto Blender's Z.
+UPRIGHT = {
+    "Z": Matrix.Identity(4),
+    "-Z": Matrix.Rotation(math.pi, 4, "X"),
+    "Y": Matrix.Rotation(math.pi / 2, 4, "X"),
+    "-Y": Matrix.Rotation(-math.pi / 2, 4, "X"),
+    "X": Matrix.Rotation(-math.pi / 2, 4, "Y"),
+    "-X": Matrix.Rotation(math.pi / 2, 4, "Y"),
+}
+
+
+def import_reel(
+    context: bpy.types.Context,
+    path: str | Path,
+    *,
+    start: float | None = None,
+    pace: str = FRAME_BY_FRAME,
+    up: str | None = None,
+    set_scene_timing: bool = False,
+) -> bpy.types.Object:
+    """Read a `.reel`, `.ply` or `.splatv` and return the object that plays it; see `add_reel`.
+
+    Raises `HoloreelError` for a missing, damaged or unknown file; then nothing is added.
+    """
+    return add_reel(context, load_gaussians(path), start=start, pace=pace, up=up, set_scene_timing=set_scene_timing)
+
+
+def add_reel(
+    context: bpy.types.Context,
+    loaded: Loaded,
+    *,
+    start: float | None = None,
+    pace: str = FRAME_BY_FRAME,
+    up: str | None = None,
+    set_scene_timing: bool = False,
+) -> bpy.types.Object:
+    """Return a new object that plays what was loaded.
+
+    `start` is the scene frame of the reel's first frame: None takes the reel's own `frame_start`, and the scene's first
+    frame for files without one. `pace` FRAMES shows one reel frame per scene frame, REAL_TIME keeps the reel's speed
+    whatever the scene's rate. `up` is the file's axis that shall point up (a key of `UPRIGHT`): None takes what the
+    file says. `set_scene_timing` sets the scene's frame range and rate to the reel's; otherwise the scene stays as it
+    is.
+    """
+    scene = context.scene
+    if start is None:
+        start = loaded.frame_start if loaded.kind == "reel" else scene.frame_start
+    if set_scene_timing:
+        _set_scene_timing(scene, loaded, start)
+    rate = scene.render.fps / scene.render.fps_base
+    timeline = Timeline(loaded.frame_count, start=start, speed=loaded.fps / rate if pace == REAL_TIME else 1.0)
+    created = create_reel_object(context, loaded.path.stem, loaded.gaussians, timeline)
+    created.matrix_world = UPRIGHT[up or loaded.up or "Z"]
+    created[INFO] = {
+        "source": str(loaded.path),
+        "kind": loaded.kind,
+        "fps": loaded.fps,
+        "frame_count": loaded.frame_count,
+        "gaussians": len(loaded.gaussians),
+        "report": "\n".join(report_of(loaded)),
+    }
+    return created
+
+
+def report_of(loaded: Loaded) -> list[str]:
+    """Say in sentences what was assumed, what is unusual, and what will not be shown."""
+    report = list(loaded.report)
+    if loaded.gaussians.variant == "full":
+        report.append("A full model: the base color is shown, without what its decoder adds (an approximation).")
+    if loaded.reel is not None and len(loaded.reel.segments) > 1:
+        report.append(f"The first of {len(loaded.reel.segments)} segments is shown.")
+    return report
 
 
 def create_reel_object(
     context: bpy.types.Context, name: str, gaussians: SpacetimeGaussians, timeline: Timeline
 ) -> bpy.types.Object:
-    """Return a new point cloud object that plays `gaussians` by `timeline`."""
-    reel = new_point_cloud(context, name, len(gaussians))
-    attributes.write(reel.data, gaussians)
-    modifier = reel.modifiers.new(MODIFIER, "NODES")
-    modifier.node_group = reel_group.reel()
-    set_timeline(reel, timeline)
-    _follow_resolution(reel)
-    return reel
+    """Return a new point cloud object that plays `gaussians` by `timeline`, in the context's collection."""
+    created = new_point_cloud(context, name, len(gaussians))
+    attributes.write(created.data, gaussians)
+    modifier = created.modifiers.new(MODIFIER, "NODES")
+    modifier.node_group = reel()
+    set_timeline(created, timeline)
+    _follow_resolution(created)
+    return created
 
 
-def modifier_of(reel: bpy.types.Object | None) -> bpy.types.NodesModifier | None:
+def modifier_of(candidate: bpy.types.Object | None) -> bpy.types.NodesModifier | None:
     """Return the modifier that plays a reel, or None if the object is no reel."""
-    if reel is None:
+    if candidate is None:
         return None
-    for modifier in reel.modifiers:
-        group = modifier.node_group if modifier.type == "NODES" else None
-        if group is not None and str(group.get("holoreel", "")).startswith("Holoreel Reel "):
+    for modifier in candidate.modifiers:
+        if modifier.type == "NODES" and modifier.node_group is not None and is_tagged(modifier.node_group, NAME):
             return modifier
     return None
 
 
-def set_timeline(reel: bpy.types.Object, timeline: Timeline) -> None:
-    """Set the mapping of the scene's frames to the reel's time."""
-    modifier = modifier_of(reel)
+def set_timeline(played: bpy.types.Object, timeline: Timeline) -> None:
+    """Set the mapping of the scene's frames to a reel's time."""
+    modifier = modifier_of(played)
     for name, value in {
         "Start Frame": timeline.start,
         "Speed": timeline.speed,
@@ -51,16 +132,21 @@ def set_timeline(reel: bpy.types.Object, timeline: Timeline) -> None:
         set_input(modifier, name, value)
 
 
-def _follow_resolution(reel: bpy.types.Object) -> None:
+def _set_scene_timing(scene: bpy.types.Scene, loaded: Loaded, start: float) -> None:
+    whole = max(1, round(loaded.fps))
+    scene.render.fps, scene.render.fps_base = whole, whole / loaded.fps
+    scene.frame_start = math.floor(start)
+    scene.frame_end = math.ceil(start) + loaded.frame_count - 1
+
+
+def _follow_resolution(played: bpy.types.Object) -> None:
     """Drive the look's picture size by the resolution of whatever scene the reel is in."""
-    modifier = modifier_of(reel)
+    modifier = modifier_of(played)
+    sources = {"percent": "render.resolution_percentage"}
     for name, side in (("Render Width", "x"), ("Render Height", "y")):
-        driver = reel.driver_add(input_path(modifier, name)).driver
+        driver = played.driver_add(input_path(modifier, name)).driver
         driver.type = "SCRIPTED"
-        for variable_name, path in (
-            ("pixels", f"render.resolution_{side}"),
-            ("percent", "render.resolution_percentage"),
-        ):
+        for variable_name, path in {**sources, "pixels": f"render.resolution_{side}"}.items():
             variable = driver.variables.new()
             variable.name = variable_name
             variable.type = "CONTEXT_PROP"

@@ -17,7 +17,7 @@ REPEATS = {
 class Timeline:
     """The mapping of a reel with `frame_count` frames, of which `first` to `last` (inclusive, from 0) are played.
 
-    At scene frame f (sub-frames count), u = (f − start) · speed + offset reel frames have passed since `first`, and with
+    At scene frame f (sub-frames count), u = (f − start) · speed + offset reel frames have passed since `first`. With
     L = last − first + 1:
 
         Hold       v = min(max(u, 0), L − 1)

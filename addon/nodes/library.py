@@ -18,6 +18,11 @@ def find(collection: bpy.types.bpy_prop_collection, name: str, version: int) -> 
     return None
 
 
+def is_tagged(block: bpy.types.ID, name: str) -> bool:
+    """Return whether a data-block was built as `name`, in any version."""
+    return str(block.get(TAG, "")).rpartition(" ")[0] == name
+
+
 def tag(block: bpy.types.ID, name: str, version: int) -> None:
     """Mark a data-block so that `find` finds it."""
     block[TAG] = f"{name} {version}"

@@ -3,7 +3,7 @@
 
 from ...core.gaussians.model import OPACITY_MIN
 from ..materials import QUAD_ATTRIBUTE, point_material, splat_material
-from .builder import Color, Float, Geometry, Rotation, Tree, Value, Vector
+from .builder import Float, Geometry, Rotation, Tree, Value, Vector
 from .library import node_group
 
 LOW_PASS_PX2, NEAR, JACOBIAN_CLAMP = 0.3, 0.2, 1.3  # the rules the models were trained under
@@ -16,7 +16,7 @@ def points_inputs(tree: Tree) -> dict[str, Float]:
     """Declare the inputs of the look Points; return them by name."""
     return {
         "Point Size": tree.float_input(
-            "Point Size", "Radius of a point, in mean standard deviations of its Gaussian", 1.0, 0.0, panel=POINTS_PANEL
+            "Point Size", "Radius of a point, in standard deviations of its Gaussian", 1.5, 0.0, panel=POINTS_PANEL
         ),
         "Hide Fainter Than": tree.float_input(
             "Hide Fainter Than",
@@ -66,13 +66,13 @@ def linear_color(tree: Tree) -> None:
 
 @node_group("Holoreel Points", 1, "Show evaluated Gaussians as opaque points, in any render engine")
 def points(tree: Tree) -> None:
-    """One point per Gaussian, as large as its mean standard deviation."""
+    """One point per Gaussian; the geometric mean of its scales, so that long thin ones do not bury the others."""
     cloud = tree.geometry_input()
     inputs = points_inputs(tree)
     faint = tree.attribute("opacity", "FLOAT").below(inputs["Hide Fainter Than"])
     cloud = tree.delete_points(cloud, faint)
-    mean_scale = tree.attribute("scale", "FLOAT_VECTOR").dot((1 / 3, 1 / 3, 1 / 3))
-    radius = mean_scale * inputs["Point Size"]
+    x, y, z = tree.attribute("scale", "FLOAT_VECTOR").axes()
+    radius = (x * y * z).power(1 / 3) * inputs["Point Size"]
     cloud = tree.geometry("GeometryNodeSetPointRadius", {"Points": cloud, "Radius": radius})
     cloud = tree.geometry("GeometryNodeSetMaterial", {"Geometry": cloud, "Material": point_material()})
     tree.output("Geometry", cloud, "Points")
@@ -104,10 +104,10 @@ class _Camera:
 def splats(tree: Tree) -> None:
     """One quad per Gaussian, parallel to the image plane (EWA splatting), far ones first.
 
-    In the plane at the center's depth z, the projected Gaussian has the covariance Σ' = A Aᵀ + low-pass, where row 0 of A
-    is S Rᵀ (right − x/z · forward), row 1 the same with up and y/z: the Jacobian of the projection times z. A quad whose
-    axes are the columns of Σ''s Cholesky factor, with exp(−r²/2) on it, is exactly what the rasterizer draws, and sorting
-    by z is its order.
+    In the plane at the center's depth z, the projected Gaussian has the covariance Σ' = A Aᵀ + low-pass, where row 0 of
+    A is S Rᵀ (right − x/z · forward), row 1 the same with up and y/z: the Jacobian of the projection times z. A quad
+    whose axes are the columns of the Cholesky factor of Σ', with exp(−r²/2) on it, is what the rasterizer draws, and
+    sorting by z is its order.
     """
     cloud = tree.geometry_input()
     inputs = splats_inputs(tree)

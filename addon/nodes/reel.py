@@ -17,14 +17,15 @@ COLORS = {
     DISPLAY: "Leave the colors as they were trained; exact with the view transform Raw",
 }
 COLOR_TOOLTIP = (
-    "A reel's colors are those of a display. Scene-Linear converts them, so that the reel looks right in an ordinary scene "
-    "under Standard or AgX, but soft edges blend slightly differently than in training. Display-Referred leaves them "
-    "alone and blends as in training: exact, if the view transform is Raw"
+    "A reel's colors are those of a display. Scene-Linear converts them, so that the reel looks right in an ordinary "
+    "scene under Standard or AgX, but soft edges blend slightly differently than in training. Display-Referred leaves "
+    "them alone and blends as in training: exact, if the view transform is Raw"
 )
 LOOK_PANEL = "Look"
+NAME = "Holoreel Reel"
 
 
-@node_group("Holoreel Reel", 1, "Play Spacetime Gaussians on the timeline")
+@node_group(NAME, 1, "Play Spacetime Gaussians on the timeline")
 def reel(tree: Tree) -> None:
     """Takes the points of `attributes.TABLE`."""
     cloud = tree.geometry_input()

@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """The looks against an independent rasterizer in numpy."""
 
-import math
 from collections.abc import Callable
 
 import bpy
@@ -111,5 +110,4 @@ def test_splats_in_cycles_are_ewa_splatting(name: str, render: Callable[[], NDAr
     truth = oracle.splat(model.evaluate(0.35), view_of(camera))
     picture = render()
     assert truth[..., 3].mean() > 0.3
-    print(name, oracle.psnr(picture, truth), np.abs(picture - truth).max())
     assert oracle.psnr(picture, truth) >= 60
