@@ -59,27 +59,14 @@ class Paints(dict):
 # -------------------------------------------------------------------------------------------------------------- backdrop
 
 
-def soft_noise(rng: np.random.Generator, x: np.ndarray, y: np.ndarray, waves: int = 24) -> np.ndarray:
-    """Smooth wandering values of standard deviation about 1 over the plane (features about 1 unit wide)."""
-    total = np.zeros(np.broadcast(x, y).shape)
-    for kx, ky, phase in zip(*rng.normal(0, 3, (2, waves)), rng.uniform(0, 2 * np.pi, waves), strict=True):
-        total += np.cos(kx * x + ky * y + phase)
-    return total / math.sqrt(waves / 2)
-
-
-def blend(stops: list[tuple[float, str]], where: np.ndarray) -> np.ndarray:
-    """sRGB colors interpolated between (position, hex color) stops."""
-    positions = [position for position, _ in stops]
-    rgb = np.array([[int(color[i : i + 2], 16) / 255 for i in (1, 3, 5)] for _, color in stops])
-    return np.stack([np.interp(where, positions, rgb[:, c]) for c in range(3)], -1)
-
-
 def paint_sky(height_m: float, radius: float, sun_at: tuple[float, float]) -> np.ndarray:
     """The painted sky: a morning gradient with broad rays about the sun, (384, 1024, 3) sRGB."""
     z = np.linspace(height_m, 0, 384)[:, None]
     arc = np.linspace(-np.radians(108), np.radians(108), 1024)[None] * radius
-    noise = soft_noise(np.random.default_rng(SEED), arc * 0.7, z * 1.2)
-    sky = blend([(0.0, "#f4b393"), (0.9, "#f8d3a6"), (1.7, "#f3e3bf"), (2.6, "#b5d6cd"), (4.0, "#7fb9c2")], z + 0.06 * noise)
+    noise = kit.soft_noise(np.random.default_rng(SEED), arc * 0.7, z * 1.2)
+    sky = kit.blend(
+        [(0.0, "#f4b393"), (0.9, "#f8d3a6"), (1.7, "#f3e3bf"), (2.6, "#b5d6cd"), (4.0, "#7fb9c2")], z + 0.06 * noise
+    )
     angle = np.arctan2(z - sun_at[1], arc - sun_at[0])
     ray = np.clip(2.5 * np.sin(14 * angle), -1, 1)
     return sky * (1 + 0.035 * ray + 0.012 * noise)[..., None]
@@ -89,32 +76,33 @@ def paint_table(size: int = 768) -> np.ndarray:
     """The table top: a compass rose in warm sand tones, (size, size, 3) sRGB."""
     x, y = np.meshgrid(np.linspace(-1, 1, size), np.linspace(1, -1, size))
     radius, angle = np.hypot(x, y), np.arctan2(y, x)
-    noise = soft_noise(np.random.default_rng(SEED + 1), x * 5, y * 5)
-    table = blend([(0.0, "#d3ab8c"), (1.0, "#e2c3a0")], radius + 0.1 * noise)
+    noise = kit.soft_noise(np.random.default_rng(SEED + 1), x * 5, y * 5)
+    table = kit.blend([(0.0, "#d3ab8c"), (1.0, "#e2c3a0")], radius + 0.1 * noise)
     rays = np.clip(6 * np.sin(16 * angle), -1, 1) * (radius > 0.5)
     ring = ((radius > 0.525) & (radius < 0.545)) | ((radius > 0.64) & (radius < 0.65))
     shade = 1 + 0.045 * rays * (radius < 0.64) - 0.03 * rays * (radius >= 0.65) + 0.02 * noise
-    return np.where(ring[..., None], blend([(0.0, "#f6e8cd")], radius), table * shade[..., None])
+    return np.where(ring[..., None], kit.blend([(0.0, "#f6e8cd")], radius), table * shade[..., None])
 
 
 def build_backdrop(paints: Paints) -> None:
     """Table, painted sky, three ranges of paper hills and a turning sun."""
-    theta = np.radians(np.linspace(-108, 108, 145))
-
-    def curtain(radius: float, z: np.ndarray) -> np.ndarray:
-        return np.stack([np.broadcast_to(radius * np.sin(theta), z.shape), np.broadcast_to(radius * np.cos(theta), z.shape), z], -1)
-
-    sky = kit.mural("Painted sky", paint_sky(4.4, 5.0, (0.9, 1.15)))
-    kit.strip("Sky", curtain(5.0, np.linspace(0, 4.4, 5)[:, None] + 0 * theta), [sky], smooth=True)
-    table = kit.mural("Compass table", paint_table())
-    kit.strip("Table", np.array([[(-5, -5, 0), (5, -5, 0)], [(-5, 5, 0), (5, 5, 0)]], float), [table])
-    ranges = (("far", 4.75, 0.95, "#c9a3ad", 0.0), ("middle", 4.45, 0.66, "#9d8fae", 2.0), ("near", 4.1, 0.42, "#6f8ba5", 4.1))
+    kit.curtain("Sky", 5.0, 0.0, 4.4, [kit.mural("Painted sky", paint_sky(4.4, 5.0, (0.9, 1.15)))])
+    kit.ground("Table", 5.0, [kit.mural("Compass table", paint_table())])
+    theta = kit.CURTAIN_ANGLES
+    ranges = (
+        ("far", 4.75, 0.95, "#c9a3ad", 0.0),
+        ("middle", 4.45, 0.66, "#9d8fae", 2.0),
+        ("near", 4.1, 0.42, "#6f8ba5", 4.1),
+    )
     for name, radius, height, color, phase in ranges:
-        crest = height * (1 + 0.22 * np.sin(5 * theta + phase) + 0.13 * np.sin(11 * theta + 2 * phase) + 0.05 * np.sin(23 * theta))
-        rows = np.stack([0 * theta, crest * 0.5, crest])
-        kit.strip(f"Hills {name}", curtain(radius, rows), [kit.paint(f"Hills {name}", color, grain=0.07, scale=2.5)])
+        crest = height * (
+            1 + 0.22 * np.sin(5 * theta + phase) + 0.13 * np.sin(11 * theta + 2 * phase) + 0.05 * np.sin(23 * theta)
+        )
+        kit.curtain(f"Hills {name}", radius, 0.0, crest, [kit.paint(f"Hills {name}", color, grain=0.07, scale=2.5)])
     face = kit.empty("Sunrise", (0.86, 3.55, 1.2))
-    points = [(r * math.cos(a), r * math.sin(a)) for i in range(32) for r, a in [((0.86, 0.62)[i % 2], i * math.pi / 16)]]
+    points = [
+        (r * math.cos(a), r * math.sin(a)) for i in range(32) for r, a in [((0.86, 0.62)[i % 2], i * math.pi / 16)]
+    ]
     rays = kit.slab("Sun rays", points, 0.05, paints["mustard"], upright=True, parent=face)
     kit.drive(rays, "rotation_euler", kit.turn(96), 1)
     kit.slab("Sun ring", kit.blob(0.56, []), 0.1, paints["cream"], upright=True, parent=face, bevel=0.015)
@@ -123,13 +111,24 @@ def build_backdrop(paints: Paints) -> None:
 
 def build_clouds(paints: Paints) -> None:
     """Cut-out clouds that drift to and fro at different depths."""
-    puffs = [(-0.42, 0.05, 0.17), (-0.17, 0.14, 0.25), (0.15, 0.1, 0.22), (0.4, 0.02, 0.15)]
-    x = np.linspace(-0.57, 0.55, 57)
-    top = np.max([cz + np.sqrt(np.clip(r * r - (x - cx) ** 2, 0, None)) - 2 * ((x - cx) ** 2 > r * r) for cx, cz, r in puffs], axis=0)
-    outline = [*zip(x, np.full_like(x, -0.06), strict=True), *zip(x[::-1], np.maximum(top, -0.04)[::-1], strict=True)]
-    places = ((-1.75, 1.9, 1.75, 0.95, 0.0), (-0.55, 2.9, 2.15, 1.0, 1.7), (1.85, 2.3, 1.95, 1.05, 3.0), (2.55, 3.1, 1.35, 0.8, 4.2), (-2.75, 2.8, 1.3, 0.85, 5.1))
+    outline = kit.cloud_outline()
+    places = (
+        (-1.75, 1.9, 1.75, 0.95, 0.0),
+        (-0.55, 2.9, 2.15, 1.0, 1.7),
+        (1.85, 2.3, 1.95, 1.05, 3.0),
+        (2.55, 3.1, 1.35, 0.8, 4.2),
+        (-2.75, 2.8, 1.3, 0.85, 5.1),
+    )
     for number, (px, py, pz, size, phase) in enumerate(places, 1):
-        cloud = kit.slab(f"Cloud {number}", [(a * size, b * size) for a, b in outline], 0.1, paints["cream"], upright=True, bevel=0.02, at=(px, py, pz))
+        cloud = kit.slab(
+            f"Cloud {number}",
+            [(a * size, b * size) for a, b in outline],
+            0.1,
+            paints["cream"],
+            upright=True,
+            bevel=0.02,
+            at=(px, py, pz),
+        )
         kit.drive(cloud, "location", f"{px}+0.16*sin{kit.turn(FRAMES, phase)}", 0)
 
 
@@ -139,36 +138,45 @@ def build_clouds(paints: Paints) -> None:
 def build_sea(paints: Paints) -> None:
     """A wooden tray and slices of sea whose crests travel, left and right by turns."""
     rim = [(0.0, 0.13), (2.17, 0.13), (2.17, 0.22), (2.4, 0.22), (2.43, 0.0)]
-    inside_first = ("pine", "pine", "wood", "cream")
-    paint_of = [paints[key] for key in inside_first]
-    kit.lathe("Tray", rim, paint_of, segments=96, slot=lambda ring, _: ring, smooth=False, bevel=0.03)
+    floor = kit.paint("Sea floor", SEA[0], grain=0.0)
+    kit.lathe(
+        "Tray",
+        rim,
+        [floor, *paints.pick("wood", "cream")],
+        segments=96,
+        slot=lambda ring, _: max(ring - 1, 0),
+        smooth=False,
+        bevel=0.03,
+    )
     edges = np.linspace(TRAY_RADIUS, -TRAY_RADIUS, SLICES + 1)
     for number, (back, front) in enumerate(zip(edges[:-1], edges[1:], strict=True)):
         depth = 1 - number / (SLICES - 1)
         level = SEA_LEVEL + 0.1 * depth
         color = SEA[round(depth * (len(SEA) - 1))]
-        build_slice(number, front, back, level, kit.paint(f"Sea {number}", color, roughness=0.5, grain=0.09), paints["foam"])
+        build_slice(
+            number, front, back, level, kit.paint(f"Sea {number}", color, roughness=0.5, grain=0.09), paints["foam"]
+        )
 
 
-def build_slice(number: int, front: float, back: float, level: float, water: bpy.types.Material, foam: bpy.types.Material) -> None:
+def build_slice(
+    number: int, front: float, back: float, level: float, water: bpy.types.Material, foam: bpy.types.Material
+) -> None:
     """One slice of sea between two chords of the tray, with a pale lip along its crest."""
     span = np.linspace(-1, 1, 97)
-    half_front, half_back = (math.sqrt(max(TRAY_RADIUS**2 - y * y, 0.04)) for y in (front, back))
+    lip = [(front, 0.0), (front, level - 0.045), (front - 0.012, level - 0.045), (front - 0.012, level)]
+    top = [(y, level) for y in np.linspace(front, back, 5)]
+    half = [math.sqrt(max(TRAY_RADIUS**2 - y * y, 0.04)) for y, _ in [(front, 0)] * 4 + top]
     rows = np.array(
         [
-            np.c_[span * half, np.full_like(span, y), np.full_like(span, z)]
-            for half, y, z in (
-                (half_front, front, 0.0),
-                (half_front, front, level - 0.045),
-                (half_front, front - 0.012, level - 0.045),
-                (half_front, front - 0.012, level),
-                (half_back, back, level),
-            )
+            np.c_[span * w, np.full_like(span, y), np.full_like(span, z)]
+            for w, (y, z) in zip(half, lip + top, strict=True)
         ]
     )
-    piece = kit.strip(f"Sea slice {number + 1:02d}", rows, [water, foam], row_slots=(0, 1, 1, 0), smooth=False)
+    slots = (0, 1, 1, 0, 0, 0, 0, 0)
+    piece = kit.strip(f"Sea slice {number + 1:02d}", rows, [water, foam], slots=slots)
+    piece.data.polygons.foreach_set("use_smooth", np.repeat(np.arange(len(slots)) > 3, len(span) - 1))
     x = rows[..., 0].ravel()
-    moves = np.repeat([0.0, 1.0, 1.0, 1.0, 1.0], len(span)) * 0.045
+    moves = np.repeat(np.arange(len(rows)) > 0, len(span)) * 0.045
     argument = x * (2 * math.pi / 0.78) + number * 2.2
     way = 1 if number % 2 else -1
     lift = np.zeros((2, len(x), 3))
@@ -179,7 +187,14 @@ def build_slice(number: int, front: float, back: float, level: float, water: bpy
 # ------------------------------------------------------------------------------------------------------------------ land
 
 
-def build_island(paints: Paints, name: str, center: tuple[float, float], radii: tuple[float, ...], colors: tuple[str, ...], phase: float) -> float:
+def build_island(
+    paints: Paints,
+    name: str,
+    center: tuple[float, float],
+    radii: tuple[float, ...],
+    colors: tuple[str, ...],
+    phase: float,
+) -> float:
     """A hill of stacked plates; returns the height of its top."""
     z = 0.1
     for number, (radius, color) in enumerate(zip(radii, colors, strict=True)):
@@ -195,18 +210,37 @@ def build_lighthouse(paints: Paints, at: kit.Point) -> None:
     base = kit.empty("Lighthouse", at)
     profile = [(0.21 - 0.075 * t, 0.95 * t) for t in np.linspace(0, 1, 6)]
     kit.lathe("Tower", profile, paints.pick("coral", "cream"), slot=lambda ring, _: ring % 2, parent=base)
-    kit.lathe("Gallery", [(0.1, 0.93), (0.2, 0.95), (0.2, 1.0), (0.1, 1.0)], [paints["navy"]], smooth=False, parent=base)
+    kit.lathe(
+        "Gallery", [(0.1, 0.93), (0.2, 0.95), (0.2, 1.0), (0.1, 1.0)], [paints["navy"]], smooth=False, parent=base
+    )
     glass = [kit.glow("Lamp", "#ffd77a", 0.9), paints["navy"]]
-    lamp = kit.lathe("Lamp", [(0.115, 1.0), (0.115, 1.17)], glass, segments=12, slot=lambda _, i: i % 6 // 4, smooth=False, parent=base)
+    lamp = kit.lathe(
+        "Lamp",
+        [(0.115, 1.0), (0.115, 1.17)],
+        glass,
+        segments=12,
+        slot=lambda _, i: i % 6 // 4,
+        smooth=False,
+        parent=base,
+    )
     kit.drive(lamp, "rotation_euler", kit.turn(FRAMES), 2)
-    kit.lathe("Lighthouse roof", [(0.17, 1.16), (0.165, 1.19), (0.06, 1.32), (0.03, 1.36), (0.0, 1.4)], [paints["coral"]], parent=base)
+    kit.lathe(
+        "Lighthouse roof",
+        [(0.17, 1.16), (0.165, 1.19), (0.06, 1.32), (0.03, 1.36), (0.0, 1.4)],
+        [paints["coral"]],
+        parent=base,
+    )
 
 
 def build_windmill(paints: Paints, at: kit.Point) -> None:
     """A mill whose four sails turn 135 degrees in 12 frames."""
     base = kit.empty("Windmill", at)
-    kit.lathe("Mill tower", [(0.25, 0.0), (0.17, 0.62)], [paints["cream"]], segments=8, smooth=False, bevel=0.015, parent=base)
-    kit.lathe("Mill cap", [(0.2, 0.6), (0.2, 0.65), (0.15, 0.76), (0.06, 0.84), (0.0, 0.86)], [paints["rose"]], parent=base)
+    kit.lathe(
+        "Mill tower", [(0.25, 0.0), (0.17, 0.62)], [paints["cream"]], segments=8, smooth=False, bevel=0.015, parent=base
+    )
+    kit.lathe(
+        "Mill cap", [(0.2, 0.6), (0.2, 0.65), (0.15, 0.76), (0.06, 0.84), (0.0, 0.86)], [paints["rose"]], parent=base
+    )
     kit.box("Mill door", (0.11, 0.04, 0.2), paints["wood"], at=(0.0, -0.235, 0.0), parent=base)
     hub = kit.empty("Mill hub", (0.0, -0.27, 0.66), base)
     kit.drive(hub, "rotation_euler", kit.turn(32), 1)
@@ -214,8 +248,22 @@ def build_windmill(paints: Paints, at: kit.Point) -> None:
     for quarter in range(4):
         arm = kit.empty(f"Mill arm {quarter + 1}", parent=hub)
         arm.rotation_euler[1] = quarter * math.pi / 2
-        kit.slab(f"Mill spar {quarter + 1}", [(-0.02, 0.03), (0.02, 0.03), (0.02, 0.58), (-0.02, 0.58)], 0.03, paints["wood"], upright=True, parent=arm)
-        blade = kit.slab(f"Mill sail {quarter + 1}", [(0.02, 0.15), (0.17, 0.15), (0.15, 0.57), (0.02, 0.57)], 0.025, paints["coral" if quarter % 2 else "mustard"], upright=True, parent=arm)
+        kit.slab(
+            f"Mill spar {quarter + 1}",
+            [(-0.02, 0.03), (0.02, 0.03), (0.02, 0.58), (-0.02, 0.58)],
+            0.03,
+            paints["wood"],
+            upright=True,
+            parent=arm,
+        )
+        blade = kit.slab(
+            f"Mill sail {quarter + 1}",
+            [(0.02, 0.15), (0.17, 0.15), (0.15, 0.57), (0.02, 0.57)],
+            0.025,
+            paints["coral" if quarter % 2 else "mustard"],
+            upright=True,
+            parent=arm,
+        )
         blade.rotation_euler[2] = 0.25
 
 
@@ -223,17 +271,42 @@ def build_town(paints: Paints) -> None:
     """Two islands with a lighthouse, a windmill, houses and trees."""
     west = build_island(paints, "West hill", (-1.2, 0.72), (0.78, 0.64, 0.47), ("sand", "sage", "meadow"), 0.6)
     build_lighthouse(paints, (-1.22, 0.8, west))
-    east = build_island(paints, "East hill", (1.12, 0.62), (0.86, 0.72, 0.58, 0.42), ("sand", "sage", "meadow", "sage"), 2.1)
+    east = build_island(
+        paints, "East hill", (1.12, 0.62), (0.86, 0.72, 0.58, 0.42), ("sand", "sage", "meadow", "sage"), 2.1
+    )
     build_windmill(paints, (1.2, 0.72, east))
-    houses = ((0.62, 0.28, 0.36, "cream", 0.2), (0.92, 0.06, 0.36, "rose", -0.05), (1.24, 0.02, 0.36, "mustard", -0.2), (-0.76, 0.4, 0.36, "rose", 0.35), (-1.12, 0.2, 0.36, "cream", 0.0))
+    houses = (
+        (0.62, 0.28, 0.36, "cream", 0.2),
+        (0.92, 0.06, 0.36, "rose", -0.05),
+        (1.24, 0.02, 0.36, "mustard", -0.2),
+        (-0.76, 0.4, 0.36, "rose", 0.35),
+        (-1.12, 0.2, 0.36, "cream", 0.0),
+    )
     for number, (x, y, z, color, turn) in enumerate(houses, 1):
         base = kit.empty(f"House {number}", (x, y, z))
         base.rotation_euler[2] = turn
         kit.box(f"House walls {number}", (0.24, 0.2, 0.2), paints[color], parent=base, bevel=0.008)
-        roof = kit.slab(f"House roof {number}", [(-0.15, 0.18), (0.15, 0.18), (0.0, 0.34)], 0.25, paints["navy" if number % 2 else "plum"], upright=True, parent=base, bevel=0.008)
+        roof = kit.slab(
+            f"House roof {number}",
+            [(-0.15, 0.18), (0.15, 0.18), (0.0, 0.34)],
+            0.25,
+            paints["navy" if number % 2 else "plum"],
+            upright=True,
+            parent=base,
+            bevel=0.008,
+        )
         roof.location[1] = 0.0
         kit.box(f"House door {number}", (0.07, 0.03, 0.11), paints["wood"], at=(0.0, -0.1, 0.0), parent=base)
-    trees = ((0.72, 0.62, 0.62, 0.42), (0.82, 0.86, 0.62, 0.5), (1.58, 0.42, 0.5, 0.4), (1.62, 0.7, 0.5, 0.5), (-1.55, 0.62, 0.5, 0.45), (-1.66, 0.86, 0.36, 0.36), (-0.86, 0.74, 0.5, 0.5), (-0.72, 0.86, 0.36, 0.38))
+    trees = (
+        (0.72, 0.62, 0.62, 0.42),
+        (0.82, 0.86, 0.62, 0.5),
+        (1.58, 0.42, 0.5, 0.4),
+        (1.62, 0.7, 0.5, 0.5),
+        (-1.55, 0.62, 0.5, 0.45),
+        (-1.66, 0.86, 0.36, 0.36),
+        (-0.86, 0.74, 0.5, 0.5),
+        (-0.72, 0.86, 0.36, 0.38),
+    )
     for number, (x, y, z, height) in enumerate(trees, 1):
         profile = [(0.0, -0.02), (0.1, 0.04), (0.125, 0.12), (0.1, 0.26), (0.05, 0.36), (0.0, 0.42)]
         scaled = [(r * (0.6 + height), h * height / 0.42) for r, h in profile]
@@ -243,10 +316,14 @@ def build_town(paints: Paints) -> None:
 # ----------------------------------------------------------------------------------------------------------------- boats
 
 
-def hull(name: str, length: float, beam: float, height: float, materials: list[bpy.types.Material], parent: bpy.types.Object) -> None:
+def hull(
+    name: str, length: float, beam: float, height: float, materials: list[bpy.types.Material], parent: bpy.types.Object
+) -> None:
     """A toy hull, bow to +X: bottom, side and rail colors, closed by a deck in the rail color."""
     along = np.linspace(-1, 1, 25)
-    width = beam / 2 * np.sqrt(np.clip(1 - np.where(along > -0.2, (along + 0.2) / 1.2, (along + 0.2) / 1.25) ** 2, 0, 1))
+    width = (
+        beam / 2 * np.sqrt(np.clip(1 - np.where(along > -0.2, (along + 0.2) / 1.2, (along + 0.2) / 1.25) ** 2, 0, 1))
+    )
     sheer = height * (1 + 0.3 * along**2 + 0.15 * along)
     sections = []
     for across, up in ((1.0, 1.0), (1.04, 0.78), (0.98, 0.72), (0.8, 0.3), (0.45, 0.0)):
@@ -254,7 +331,7 @@ def hull(name: str, length: float, beam: float, height: float, materials: list[b
     sections += [s * (1, -1, 1) for s in sections[::-1]]
     deck = sections[0] - (0, 0, 0.025)
     rows = np.array([*sections, deck * (1, -1, 1), deck])
-    kit.strip(name, rows, materials, row_slots=(2, 2, 1, 0, 0, 0, 1, 2, 2, 2, 2), parent=parent, smooth=False)
+    kit.strip(name, rows, materials, slots=(2, 2, 1, 0, 0, 0, 1, 2, 2, 2, 2), parent=parent, smooth=False)
 
 
 def build_sailboat(paints: Paints) -> None:
@@ -272,7 +349,9 @@ def build_sailboat(paints: Paints) -> None:
     build_sail(paints, "Main sail", boat, foot=-0.36, low=0.3, high=0.98, bands=("cream", "mustard", "cream", "cream"))
     build_sail(paints, "Jib", boat, foot=0.32, low=0.3, high=0.84, bands=("cream", "cream", "coral", "cream"))
     length, columns = 0.26, np.linspace(0, 1, 13)
-    rows = np.array([np.c_[-columns * length, 0 * columns, 1.0 + side * 0.05 * (1 - 0.85 * columns)] for side in (-1, 1)])
+    rows = np.array(
+        [np.c_[-columns * length, 0 * columns, 1.0 + side * 0.05 * (1 - 0.85 * columns)] for side in (-1, 1)]
+    )
     pennant = kit.strip("Pennant", rows, [paints["coral"]], parent=boat, smooth=True)
     sway = np.tile(columns, 2)
     offsets = np.zeros((2, len(sway), 3))
@@ -280,13 +359,17 @@ def build_sailboat(paints: Paints) -> None:
     kit.wave_keys(pennant, offsets[0], offsets[1], 12)
 
 
-def build_sail(paints: Paints, name: str, boat: bpy.types.Object, *, foot: float, low: float, high: float, bands: tuple[str, ...]) -> None:
+def build_sail(
+    paints: Paints, name: str, boat: bpy.types.Object, *, foot: float, low: float, high: float, bands: tuple[str, ...]
+) -> None:
     """A triangular sail from the mast out to `foot`, striped upwards, filling and easing with the wind."""
     u, v = np.meshgrid(np.linspace(0, 1, 13), np.linspace(0, 0.97, 4 * len(bands) + 1))
     belly = np.sin(np.pi * np.minimum(u * 0.9 + 0.05, 1)) * (1 - v) ** 0.6
     rows = np.stack([(0.02 * np.sign(foot) + foot * u) * (1 - v), 0.1 * belly, low + (high - low) * v], -1)
     keys = list(dict.fromkeys(bands))
-    sail = kit.strip(name, rows, paints.pick(*keys), row_slots=np.repeat([keys.index(b) for b in bands], 4), parent=boat, smooth=True)
+    sail = kit.strip(
+        name, rows, paints.pick(*keys), slots=np.repeat([keys.index(b) for b in bands], 4), parent=boat, smooth=True
+    )
     fill = np.zeros((2, u.size, 3))
     fill[0, :, 1] = 0.07 * belly.ravel()
     fill[1, :, 0] = 0.02 * (u * v).ravel()
@@ -306,13 +389,24 @@ def build_tug(paints: Paints) -> None:
     kit.box("Tug cabin", (0.2, 0.17, 0.16), paints["cream"], at=(0.05, 0, 0.13), parent=tug, bevel=0.012)
     kit.box("Tug roof", (0.25, 0.21, 0.035), paints["coral"], at=(0.05, 0, 0.29), parent=tug, bevel=0.01)
     funnel = paints.pick("mustard", "navy")
-    kit.lathe("Tug funnel", [(0.055, 0.13), (0.055, 0.3), (0.06, 0.36)], funnel, slot=lambda ring, _: ring, segments=20, parent=tug, at=(-0.14, 0, 0))
+    kit.lathe(
+        "Tug funnel",
+        [(0.055, 0.13), (0.055, 0.3), (0.06, 0.36)],
+        funnel,
+        slot=lambda ring, _: ring,
+        segments=20,
+        parent=tug,
+        at=(-0.14, 0, 0),
+    )
     for number, born in enumerate((-10, -3, 5, 13, 21, 29, 37, 45), 1):
         at_birth = first + born * sweep / FRAMES
         reach = TUG_PATH["radius"]
         x, y = reach * math.cos(at_birth), reach * math.sin(at_birth)
         puff = kit.ball(f"Puff {number}", 0.11, paints["smoke"], at=(x + 0.08, y + 0.12, 0.62))
-        kit.pop(puff, [(born, 0.0), (born + 1, 0.35), (born + 3, 0.9), (born + 11, 1.15), (born + 12, 0.5), (born + 13, 0.0)])
+        kit.pop(
+            puff,
+            [(born, 0.0), (born + 1, 0.35), (born + 3, 0.9), (born + 11, 1.15), (born + 12, 0.5), (born + 13, 0.0)],
+        )
         kit.drive(puff, "location", f"{x + 0.08:.4f}-0.012*(frame-{born})", 0)
         kit.drive(puff, "location", f"0.62+0.03*(frame-{born})", 2)
 
@@ -334,7 +428,7 @@ def build_whale(paints: Paints) -> None:
     around = np.linspace(-np.pi / 2, 1.5 * np.pi, 25)
     rows = np.array([np.c_[stations, wide * np.cos(a), rise + tall * np.sin(a)] for a in around])
     slots = [1 if math.sin(a + np.pi / 24) < -0.25 else 0 for a in around[:-1]]
-    body = kit.strip("Whale body", rows, paints.pick("whale", "cream"), row_slots=slots, smooth=True, parent=whale)
+    body = kit.strip("Whale body", rows, paints.pick("whale", "cream"), slots=slots, smooth=True, parent=whale)
     bend = np.zeros((2, rows.shape[0] * rows.shape[1], 3))
     reach = np.tile(np.clip((stations + 0.05) / 0.6, 0, None) ** 2, len(around))
     bend[0, :, 2], bend[1, :, 1] = 0.12 * reach, 0.04 * reach
@@ -344,7 +438,17 @@ def build_whale(paints: Paints) -> None:
         fin = kit.ball(f"Whale fin {side}", 0.13, paints["whale"], at=(-0.08, side * 0.23, -0.02), parent=whale)
         fin.scale, fin.rotation_euler = (0.6, 1.0, 0.22), (-side * 0.5, 0.2, 0.0)
     spout = kit.empty("Spout", (-0.18, 0.0, 0.2), whale)
-    drops = ((0.0, 0.1, 0.06), (0.0, 0.2, 0.065), (-0.1, 0.27, 0.06), (0.1, 0.27, 0.06), (-0.19, 0.22, 0.05), (0.19, 0.22, 0.05), (0.0, 0.31, 0.06))
+    drops = (
+        (0.0, 0.08, 0.05),
+        (0.0, 0.17, 0.052),
+        (0.0, 0.26, 0.055),
+        (-0.1, 0.31, 0.05),
+        (0.1, 0.31, 0.05),
+        (-0.19, 0.27, 0.045),
+        (0.19, 0.27, 0.045),
+        (-0.24, 0.18, 0.04),
+        (0.24, 0.18, 0.04),
+    )
     for number, (x, z, radius) in enumerate(drops, 1):
         drop = kit.ball(f"Spout drop {number}", radius, paints["foam"], at=(x, 0.0, z), parent=spout)
         kit.pop(drop, [(4, 0.0), (5, 0.6), (7, 1.0), (22, 1.05), (25, 0.5), (26, 0.0)])
@@ -362,16 +466,31 @@ def build_balloon(paints: Paints) -> None:
     radius = 0.37 * np.sin(np.pi * t**0.78) ** 0.8 * (1 - 0.04 * t) + 0.075 * (1 - t) ** 3
     profile = [(max(r, 0.001), -0.46 + 0.86 * h) for r, h in zip(radius, t, strict=True)]
     stripes = paints.pick("coral", "cream", "mustard", "navy")
-    kit.lathe("Envelope", profile, stripes, segments=48, slot=lambda ring, i: 3 if ring in (0, 1, 20) else (0, 1, 2, 1)[i // 4 % 4], parent=balloon)
+    kit.lathe(
+        "Envelope",
+        profile,
+        stripes,
+        segments=48,
+        slot=lambda ring, i: 3 if ring in (0, 1, 20) else (0, 1, 2, 1)[i // 4 % 4],
+        parent=balloon,
+    )
     kit.lathe("Skirt", [(0.07, -0.46), (0.055, -0.56)], [paints["cream"]], segments=16, parent=balloon)
-    kit.lathe("Basket", [(0.065, -0.68), (0.085, -0.56)], [paints["wood"]], segments=16, smooth=False, parent=balloon, bevel=0.01)
+    kit.lathe(
+        "Basket",
+        [(0.065, -0.68), (0.085, -0.56)],
+        [paints["wood"]],
+        segments=16,
+        smooth=False,
+        parent=balloon,
+        bevel=0.01,
+    )
 
 
 def build_gulls(paints: Paints) -> None:
     """Three paper gulls that circle the lighthouse with beating wings."""
-    flock = kit.empty("Gulls", (-1.15, 0.7, 1.95))
+    flock = kit.empty("Gulls", (-1.4, 0.7, 1.98))
     kit.drive(flock, "rotation_euler", kit.turn(96), 2)
-    for number, (angle, radius, z) in enumerate(((3.4, 0.55, 0.02), (4.6, 0.75, 0.22), (5.6, 0.5, -0.12)), 1):
+    for number, (angle, radius, z) in enumerate(((3.4, 0.5, 0.0), (4.9, 0.6, 0.12), (6.0, 0.52, -0.14)), 1):
         gull = kit.empty(f"Gull {number}", (radius * math.cos(angle), radius * math.sin(angle), z), flock)
         gull.rotation_euler[2] = angle + math.pi / 2
         span = np.linspace(-1, 1, 13)

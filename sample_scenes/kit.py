@@ -19,6 +19,7 @@ Point = tuple[float, float, float]
 Outline = Sequence[tuple[float, float]]
 
 TARGET_NAME = "Holoreel Target"
+CURTAIN_ANGLES = np.radians(np.linspace(-108, 108, 145))  # about Z, 0 is straight behind the scene
 
 
 def linear_rgb(color: str) -> tuple[float, float, float]:
@@ -31,7 +32,9 @@ def linear_rgb(color: str) -> tuple[float, float, float]:
 # ---------------------------------------------------------------------------------------------------------------- paints
 
 
-def paint(name: str, color: str, *, roughness: float = 0.8, grain: float = 0.1, scale: float = 6.0) -> bpy.types.Material:
+def paint(
+    name: str, color: str, *, roughness: float = 0.8, grain: float = 0.1, scale: float = 6.0
+) -> bpy.types.Material:
     """A Principled material whose color wanders by ±`grain` (relative) over blotches about 1/`scale` m wide."""
     material = bpy.data.materials.new(name)
     material.use_nodes = True
@@ -49,9 +52,7 @@ def paint(name: str, color: str, *, roughness: float = 0.8, grain: float = 0.1, 
     noise.inputs["Scale"].default_value = scale
     noise.inputs["Detail"].default_value = 1.0
     ramp = tree.nodes.new("ShaderNodeValToRGB")
-    for stop, (position, gain) in zip(
-        ramp.color_ramp.elements, ((0.3, 1.0 - grain), (0.7, 1.0 + grain)), strict=True
-    ):
+    for stop, (position, gain) in zip(ramp.color_ramp.elements, ((0.3, 1.0 - grain), (0.7, 1.0 + grain)), strict=True):
         stop.position = position
         stop.color = (*(c * gain for c in rgb), 1.0)
     tree.links.new(place.outputs["Object"], noise.inputs["Vector"])
@@ -90,6 +91,21 @@ def glow(name: str, color: str, strength: float) -> bpy.types.Material:
     shader.inputs["Emission Strength"].default_value = strength
     material.cycles.emission_sampling = "NONE"
     return material
+
+
+def soft_noise(rng: np.random.Generator, x: np.ndarray, y: np.ndarray, waves: int = 24) -> np.ndarray:
+    """Smooth wandering values of standard deviation about 1 over the plane (features about 1 unit wide)."""
+    total = np.zeros(np.broadcast(x, y).shape)
+    for kx, ky, phase in zip(*rng.normal(0, 3, (2, waves)), rng.uniform(0, 2 * np.pi, waves), strict=True):
+        total += np.cos(kx * x + ky * y + phase)
+    return total / math.sqrt(waves / 2)
+
+
+def blend(stops: list[tuple[float, str]], where: np.ndarray) -> np.ndarray:
+    """sRGB colors interpolated between (position, hex color) stops."""
+    positions = [position for position, _ in stops]
+    rgb = np.array([[int(color[i : i + 2], 16) / 255 for i in (1, 3, 5)] for _, color in stops])
+    return np.stack([np.interp(where, positions, rgb[:, c]) for c in range(3)], -1)
 
 
 # ---------------------------------------------------------------------------------------------------------------- shapes
@@ -176,7 +192,9 @@ def lathe(
     for ring in range(len(profile) - 1):
         for i in range(segments):
             j = (i + 1) % segments
-            faces.append((ring * segments + i, ring * segments + j, (ring + 1) * segments + j, (ring + 1) * segments + i))
+            faces.append(
+                (ring * segments + i, ring * segments + j, (ring + 1) * segments + j, (ring + 1) * segments + i)
+            )
             slots.append(slot(ring, i))
     last = (len(profile) - 1) * segments
     faces += [tuple(range(segments))[::-1], tuple(range(last, last + segments))]
@@ -190,7 +208,9 @@ def ball_profile(radius: float, rings: int = 16, *, low: float = -1.0, high: flo
     return [(radius * math.cos(a), radius * math.sin(a)) for a in angles]
 
 
-def ball(name: str, radius: float, material: bpy.types.Material, *, stretch: float = 1.0, **options) -> bpy.types.Object:
+def ball(
+    name: str, radius: float, material: bpy.types.Material, *, stretch: float = 1.0, **options
+) -> bpy.types.Object:
     """A ball, stretched along Z."""
     profile = [(r, z * stretch) for r, z in ball_profile(radius, options.pop("rings", 14))]
     return lathe(name, profile, [material], segments=options.pop("segments", 24), **options)
@@ -210,18 +230,47 @@ def blob(radius: float, wobble: Sequence[tuple[int, float, float]], count: int =
 
 
 def strip(
-    name: str, rows: np.ndarray, materials: Sequence[bpy.types.Material], *, row_slots: Sequence[int] = (), **options
+    name: str, rows: np.ndarray, materials: Sequence[bpy.types.Material], *, slots: np.ndarray | Sequence = 0, **options
 ) -> bpy.types.Object:
-    """A sheet through rows of points, (rows, columns, 3), with UVs: u along the columns, v along the rows."""
+    """A sheet through rows of points, (rows, columns, 3), with UVs: u along the columns, v along the rows.
+
+    `slots` are material slots: one for all, one per row of faces, or (rows - 1, columns - 1).
+    """
     count, columns, _ = rows.shape
     index = np.arange(count * columns).reshape(count, columns)
     faces = np.stack([index[:-1, :-1], index[:-1, 1:], index[1:, 1:], index[1:, :-1]], -1).reshape(-1, 4)
-    slots = np.repeat(row_slots, columns - 1) if len(row_slots) else np.zeros(len(faces), int)
-    thing = add_mesh(name, rows.reshape(-1, 3), faces, materials, slots=slots, **options)
+    slots = np.asarray(slots)
+    slots = np.broadcast_to(slots[:, None] if slots.ndim == 1 else slots, (count - 1, columns - 1))
+    thing = add_mesh(name, rows.reshape(-1, 3), faces, materials, slots=slots.ravel(), **options)
     u, v = np.meshgrid(np.linspace(0, 1, columns), np.linspace(0, 1, count))
     layer = thing.data.uv_layers.new(name="UVMap")
     layer.uv.foreach_set("vector", np.stack([u, v], -1).reshape(-1, 2)[faces.ravel()].astype(np.float32).ravel())
     return thing
+
+
+def curtain(
+    name: str, radius: float, low: float, high: float | np.ndarray, materials: Sequence[bpy.types.Material]
+) -> bpy.types.Object:
+    """A wall bent around the scene's back, its upper edge level or given at CURTAIN_ANGLES."""
+    heights = np.linspace(low + 0 * CURTAIN_ANGLES, high + 0 * CURTAIN_ANGLES, 4)
+    across, away = radius * np.sin(CURTAIN_ANGLES), radius * np.cos(CURTAIN_ANGLES)
+    rows = np.stack([np.broadcast_to(across, heights.shape), np.broadcast_to(away, heights.shape), heights], -1)
+    return strip(name, rows, materials, smooth=True)
+
+
+def ground(name: str, half: float, materials: Sequence[bpy.types.Material]) -> bpy.types.Object:
+    """A square floor at z = 0."""
+    corners = [[(-half, -half, 0.0), (half, -half, 0.0)], [(-half, half, 0.0), (half, half, 0.0)]]
+    return strip(name, np.array(corners), materials)
+
+
+def cloud_outline() -> list[tuple[float, float]]:
+    """The outline of a paper cloud about 1.1 m wide with a flat foot."""
+    puffs = [(-0.42, 0.05, 0.17), (-0.17, 0.14, 0.25), (0.15, 0.1, 0.22), (0.4, 0.02, 0.15)]
+    x = np.linspace(-0.57, 0.55, 57)
+    tops = [cz + np.sqrt(np.clip(r * r - (x - cx) ** 2, 0, None)) - 2 * ((x - cx) ** 2 > r * r) for cx, cz, r in puffs]
+    top = np.maximum(np.max(tops, axis=0), -0.04)
+    return [*zip(x, np.full_like(x, -0.06), strict=True), *zip(x[::-1], top[::-1], strict=True)]
 
 
 # --------------------------------------------------------------------------------------------------------------- motions
@@ -276,6 +325,7 @@ def start(frames: int = 48) -> bpy.types.Scene:
     cycles = scene.cycles
     cycles.samples = 96
     cycles.use_denoising = True
+    cycles.denoising_prefilter = "FAST"
     cycles.max_bounces, cycles.diffuse_bounces, cycles.glossy_bounces = 3, 2, 1
     cycles.use_fast_gi, cycles.ao_bounces_render = True, 1
     cycles.transmission_bounces = cycles.volume_bounces = cycles.transparent_max_bounces = 0
