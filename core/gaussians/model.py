@@ -16,14 +16,15 @@ ALWAYS_LOG_SCALE = (
     16.0  # log of a width at which the temporal opacity is 1 to the last float32 bit, anywhere near [0, 1]
 )
 
-# Shape of one row, and the range in which float32 arithmetic on it stays finite (exp of a scale, the square of a
-# quaternion). Rows outside are as useless as NaN. Widths have no upper limit but finiteness: wide means always visible.
+# Shape of one row, and the range in which float32 arithmetic on it stays finite (a squared scale in pixels, the square
+# of a quaternion). Rows outside are as useless as NaN. Widths may be as large as they like (always visible), scales as
+# small (flat).
 ROWS: dict[str, tuple[tuple[int, ...], float, float]] = {
     "means": ((3,), -1e12, 1e12),
     "motions": ((3, 3), -1e12, 1e12),
     "quats": ((4,), -1e12, 1e12),
     "omegas": ((4,), -1e12, 1e12),
-    "log_scales": ((3,), -40.0, 40.0),
+    "log_scales": ((3,), -1e30, 30.0),
     "opacity_logits": ((), -1e30, 1e30),
     "features": ((3,), -1e12, 1e12),
     "trbf_centers": ((), -1e6, 1e6),

@@ -55,7 +55,7 @@ def test_zero_quaternions_mean_no_rotation(random_model):
 @given(st.floats(-3.0, 3.0), st.floats(-38.0, 50.0), st.floats(-200.0, 200.0))
 def test_evaluation_stays_finite(time, log_width, opacity_logit):
     model = SpacetimeGaussians(
-        [[0, 0, 0]], np.ones((1, 3, 3)), [[0, 0, 0, 1e-30]], np.zeros((1, 4)), [[39.0, -39.0, 0.0]], [opacity_logit],
+        [[0, 0, 0]], np.ones((1, 3, 3)), [[0, 0, 0, 1e-30]], np.zeros((1, 4)), [[29.0, -500.0, 0.0]], [opacity_logit],
         [[1, 2, 3]], [0.5], [log_width],
     )  # fmt: skip
     assert not model.bad_rows().any()

@@ -10,6 +10,8 @@ from holoreel.core.errors import HoloreelError
 from holoreel.core.gaussians.model import ROWS
 from holoreel.core.gaussians.ply import read_ply, write_ply
 from holoreel.core.plyfile import read_vertices, write_vertices
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
 
 # The order of the authors' files, with the place of each value in `telling_model` (see conftest): 3 means, 9 motions,
 # 4 quats, 4 omegas, 3 scales, opacity, features, center, width.
@@ -112,6 +114,25 @@ def test_nan_rows_are_left_out_and_counted(tmp_path, random_model):
     write_ply(tmp_path / "a.ply", model)
     with pytest.raises(HoloreelError, match=r"a\.ply has NaN .* all of its 20 rows"):
         read_ply(tmp_path / "a.ply")
+
+
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=40)
+@given(st.integers(0, 2**32 - 1), st.sampled_from([3, 9]))
+def test_any_values_become_finite_gaussians(tmp_path, seed, features):
+    """Every bit pattern of a float, among them NaN, infinities, denormals and giants, in files of the right layout."""
+    width = 38 if features == 9 else 32
+    values = np.random.default_rng(seed).integers(0, 2**32, (60, width), np.uint32)
+    calm = np.random.default_rng(seed).random(values.shape) < 0.95  # so that some rows survive
+    values[calm] = np.float32(0.5).view(np.uint32)
+    header = authors_file(60, features).split(b"end_header\n")[0] + b"end_header\n"
+    (tmp_path / "a.ply").write_bytes(header + values.astype("<u4").tobytes())
+    with suppress(HoloreelError):
+        model, _ = read_ply(tmp_path / "a.ply")
+        for time in (-1.0, 0.0, 0.5, 1.0):
+            for array in (*vars(model).values(), *vars(model.evaluate(time)).values()):
+                assert np.isfinite(array).all()
+        bounds = model.bounds()
+        assert bounds is None or np.isfinite(bounds).all()
 
 
 def test_a_file_without_gaussians_is_refused(tmp_path, random_model):

@@ -11,6 +11,8 @@ import pytest
 from holoreel.core.errors import HoloreelError
 from holoreel.core.gaussians.model import ROWS
 from holoreel.core.gaussians.splatv import read_splatv
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
 
 ROW = 65536
 
@@ -128,6 +130,17 @@ def test_flipped_header_bytes_never_crash(tmp_path):
         (tmp_path / "a.splatv").write_bytes(damaged)
         with suppress(HoloreelError):  # a flip in the list of cameras does no harm
             assert len(read_splatv(tmp_path / "a.splatv")[0]) == 3
+
+
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=40)
+@given(st.binary(min_size=64, max_size=64 * 8).map(lambda data: data[: len(data) // 64 * 64]))
+def test_any_payload_becomes_finite_gaussians(tmp_path, payload):
+    (tmp_path / "a.splatv").write_bytes(pack([payload], padded=False))
+    with suppress(HoloreelError):
+        model, _ = read_splatv(tmp_path / "a.splatv")
+        assert 0 < len(model) <= len(payload) // 64
+        for values in (*vars(model).values(), *vars(model.evaluate(0.3)).values()):
+            assert np.isfinite(values).all()
 
 
 @pytest.mark.parametrize(
