@@ -18,7 +18,10 @@ class HOLOREEL_OT_import_reel(bpy.types.Operator, ImportHelper):
 
     bl_idname = "holoreel.import_reel"
     bl_label = "Import Reel"
-    bl_description = "Import Spacetime Gaussians from .reel, .ply or .splatv files; each becomes a point cloud that plays on the timeline"
+    bl_description = (
+        "Import Spacetime Gaussians from .reel, .ply or .splatv files; each becomes a point cloud that plays "
+        "on the timeline"
+    )
     bl_options = {"REGISTER", "UNDO"}
 
     filename_ext = ".reel"

@@ -8,10 +8,11 @@ import numpy as np
 import pytest
 from holoreel.addon import compat, reels
 from holoreel.addon.exact import setup_exact_render
+from holoreel.addon.nodes.reel import DISPLAY
 from holoreel.addon.timeline import Timeline
 from holoreel.core.gaussians.model import SpacetimeGaussians
 from holoreel.tests.blender import oracle
-from mathutils import Matrix
+from mathutils import Euler, Matrix
 from numpy.typing import NDArray
 
 TIME_FRAMES = 10  # frames of the test's reels
@@ -98,6 +99,13 @@ CAMERAS = {
 }
 
 
+def render_exactly(render: Callable[[], NDArray], engine: str = "CYCLES") -> NDArray:
+    """Set the scene up and render it."""
+    bpy.context.scene.render.engine = engine
+    setup_exact_render(bpy.context.scene)
+    return render()
+
+
 @pytest.mark.parametrize("name", CAMERAS)
 def test_splats_in_cycles_are_ewa_splatting(name: str, render: Callable[[], NDArray]) -> None:
     settings, size, pixel_aspect = CAMERAS[name]
@@ -105,9 +113,125 @@ def test_splats_in_cycles_are_ewa_splatting(name: str, render: Callable[[], NDAr
     camera = make_camera(**settings)
     model = wide_model()
     show(model, 0.35)
-    setup_exact_render(bpy.context.scene)
-    bpy.context.scene.render.engine = "CYCLES"
     truth = oracle.splat(model.evaluate(0.35), view_of(camera))
-    picture = render()
     assert truth[..., 3].mean() > 0.3
-    assert oracle.psnr(picture, truth) >= 60
+    assert oracle.psnr(render_exactly(render), truth) >= 60
+
+
+def test_splats_follow_resolution_percentage_and_render_frame(render: Callable[[], NDArray]) -> None:
+    camera = make_camera()
+    model = wide_model()
+    show(model, 0.2)
+    resize(200, 140)
+    bpy.context.scene.render.resolution_percentage = 40
+    picture = render_exactly(render)
+    resize(80, 56)
+    assert oracle.psnr(picture, oracle.splat(model.evaluate(0.2), view_of(camera))) >= 60
+
+
+def test_colors_beyond_the_display_pass_through(render: Callable[[], NDArray]) -> None:
+    resize(64, 48)
+    camera = make_camera()
+    model = wide_model()
+    model.features[:] = 1.8 * model.features - 0.4
+    show(model, 0.5)
+    truth = oracle.splat(model.evaluate(0.5), view_of(camera))
+    assert truth[..., :3].min() < -0.05
+    assert truth[..., :3].max() > 1.05
+    assert oracle.psnr(render_exactly(render), truth) >= 60
+
+
+def test_object_can_be_moved_turned_and_scaled(render: Callable[[], NDArray]) -> None:
+    resize(96, 64)
+    camera = make_camera(shift=(0.1, 0.0))
+    model = wide_model()
+    reel = show(model, 0.6)
+    scale = 2.5
+    placed = Matrix.LocRotScale((0.4, -0.3, 2.0), Euler((0.3, -0.2, 0.5)), (scale,) * 3)
+    reel.matrix_world = placed
+    camera.parent = bpy.data.objects.new("parent", None)
+    bpy.context.scene.collection.objects.link(camera.parent)
+    camera.parent.scale = (3.0, 3.0, 3.0)
+    camera.parent.rotation_euler = (0.0, 0.1, 0.2)
+    bpy.context.view_layer.update()
+    view = view_of(camera)
+    # Seen from the model, a scaled object is a camera that is nearer by the same factor.
+    view.world_to_camera = view.world_to_camera @ np.array(placed)
+    view.world_to_camera[:3] /= scale
+    assert oracle.psnr(render_exactly(render), oracle.splat(model.evaluate(0.6), view)) >= 60
+
+
+def test_splats_follow_the_active_camera(render: Callable[[], NDArray]) -> None:
+    resize(64, 48)
+    make_camera()
+    model = wide_model()
+    show(model, 0.5)
+    render_exactly(render)
+    second = make_camera(lens=50.0)
+    second.location = (0.5, 0.2, -1.0)
+    bpy.context.view_layer.update()
+    truth = oracle.splat(model.evaluate(0.5), view_of(second))
+    assert oracle.psnr(render_exactly(render), truth) >= 60
+
+
+def test_orthographic_splats_are_projected_covariances(render: Callable[[], NDArray]) -> None:
+    """From far away with a long lens, perspective is orthographic."""
+    resize(64, 48)
+    camera = make_camera()
+    model = wide_model()
+    model.means[:, 2] = np.abs(model.means[:, 2]) + 1.0
+    show(model, 0.5)
+    camera.data.type, camera.data.ortho_scale = "ORTHO", 6.0
+    picture = render_exactly(render)
+    far = 1e4
+    pose = np.eye(4)
+    pose[2, 3] = far
+    focal = far * 64 / 6.0
+    truth = oracle.splat(model.evaluate(0.5), oracle.View(64, 48, focal, focal, 32, 24, pose))
+    assert oracle.psnr(picture, truth) >= 45
+
+
+@pytest.mark.parametrize("engine", ["CYCLES"])
+def test_points_show_their_colors(engine: str, render: Callable[[], NDArray]) -> None:
+    resize(64, 48)
+    make_camera()
+    model = wide_model(5)
+    model.means[:] = [[0, 0, 2], [-0.8, 0, 2], [0.8, 0, 2], [0, 0.5, 2], [0, -0.5, 2]]
+    model.motions[:] = 0
+    model.log_scales[:] = np.log(0.05)
+    model.opacity_logits[:] = [9, 9, 9, 9, -3]
+    model.trbf_log_scales[:] = 16
+    camera = bpy.context.scene.camera
+    show(model, 0.5, "Points")
+    picture = render_exactly(render, engine)
+    view = view_of(camera)
+    for index, mean in enumerate(model.means):
+        column, row = int(view.fx * mean[0] / mean[2] + view.cx), int(view.fy * mean[1] / mean[2] + view.cy)
+        expected = [*model.features[index], 1.0] if index < 4 else [0.0] * 4  # the last is too faint
+        np.testing.assert_allclose(picture[row, column], expected, atol=1e-5)
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("gpu")
+@pytest.mark.parametrize("name", ["plain", "shifted"])
+def test_splats_in_eevee_are_ewa_splatting(name: str, render: Callable[[], NDArray]) -> None:
+    settings, size, pixel_aspect = CAMERAS[name]
+    resize(*size, pixel_aspect)
+    camera = make_camera(**settings)
+    model = wide_model()
+    show(model, 0.35)
+    picture = render_exactly(render, compat.eevee_engine())
+    assert oracle.psnr(picture, oracle.splat(model.evaluate(0.35), view_of(camera))) >= 45
+
+
+def test_exact_set_up_keeps_the_engine_and_says_what_it_means() -> None:
+    make_camera()
+    reel = show(wide_model(), 0.5)
+    scene = bpy.context.scene
+    for engine, after in (("CYCLES", "CYCLES"), (compat.eevee_engine(),) * 2, ("BLENDER_WORKBENCH", "CYCLES")):
+        scene.render.engine = engine
+        setup_exact_render(scene)
+        assert scene.render.engine == after
+    assert scene.view_settings.view_transform == "Raw"
+    assert compat.get_input(reels.modifier_of(reel), "Color") == DISPLAY
+    assert scene.cycles.min_transparent_bounces == scene.cycles.transparent_max_bounces >= 256

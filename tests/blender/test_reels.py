@@ -1,0 +1,251 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Reels on the timeline: what the nodes evaluate against numpy, and what importing does to a file."""
+
+import json
+from collections.abc import Callable
+from fractions import Fraction
+from pathlib import Path
+
+import bpy
+import numpy as np
+import pytest
+from holoreel.addon import attributes, compat, reels
+from holoreel.addon.nodes.reel import DISPLAY, LINEAR, LOOKS, POINTS
+from holoreel.addon.timeline import HOLD, LOOP, PING_PONG, Timeline
+from holoreel.core.errors import HoloreelError
+from holoreel.core.gaussians.model import EvaluatedGaussians, SpacetimeGaussians
+from holoreel.core.reel import save_gaussians
+from mathutils import Vector
+from numpy.typing import NDArray
+
+Model = Callable[..., SpacetimeGaussians]
+
+
+def awkward(model: SpacetimeGaussians) -> SpacetimeGaussians:
+    """Add what breaks careless arithmetic: zero quaternions, endless and minute widths, certain and absent opacity."""
+    model.quats[:10] = 0.0
+    model.omegas[:5] = 0.0
+    model.trbf_log_scales[10:20] = 1e30
+    model.trbf_log_scales[20:30] = 16.0
+    model.trbf_log_scales[30:40] = -40.0
+    model.trbf_centers[30:35] = 0.0
+    model.opacity_logits[40:45] = 1e30
+    model.opacity_logits[45:50] = -1e30
+    return model
+
+
+def show_points(reel: bpy.types.Object, color: str = DISPLAY) -> bpy.types.NodesModifier:
+    """Let a reel show all of its evaluated Gaussians as points."""
+    modifier = reels.modifier_of(reel)
+    compat.set_input(modifier, "Look", POINTS)
+    compat.set_input(modifier, "Color", color)
+    compat.set_input(modifier, "Hide Fainter Than", 0.0)
+    return modifier
+
+
+def seek(frame: float) -> None:
+    """Go to a scene frame and its fraction."""
+    bpy.context.scene.frame_set(int(np.floor(frame)), subframe=frame - np.floor(frame))
+
+
+def evaluated(reel: bpy.types.Object) -> dict[str, NDArray[np.float32]]:
+    """Read what the nodes made of a reel."""
+    geometry = reel.evaluated_get(bpy.context.evaluated_depsgraph_get()).evaluated_geometry()
+    if geometry.pointcloud is None:
+        return {"position": np.zeros((0, 3), np.float32)}
+    found = geometry.pointcloud.attributes
+    return {name: attributes.read(found, name) for name in ("position", "rotation", "opacity", "scale", "rgb")}
+
+
+def assert_same(shown: dict[str, NDArray[np.float32]], truth: EvaluatedGaussians) -> None:
+    """Compare what the nodes evaluated with numpy's survivors."""
+    truth = truth.take(truth.alive)
+    assert len(shown["position"]) == len(truth) > 0
+    np.testing.assert_allclose(shown["position"], truth.means, rtol=1e-6, atol=1e-5)
+    np.testing.assert_allclose(shown["rotation"], truth.quats, rtol=0, atol=1e-5)
+    np.testing.assert_allclose(shown["opacity"], truth.opacities, rtol=0, atol=1e-5)
+    np.testing.assert_allclose(shown["scale"], truth.scales, rtol=1e-5)
+    np.testing.assert_array_equal(shown["rgb"][:, :3], truth.features[:, :3])
+
+
+@pytest.mark.parametrize("repeat", [HOLD, LOOP, PING_PONG])
+def test_nodes_evaluate_as_numpy_does(repeat: str, random_model: Model) -> None:
+    random = np.random.default_rng(5)
+    model = awkward(random_model(3000))
+    timeline = Timeline(40, start=3.5, speed=0.7, offset=0.25, first=2, last=33, repeat=repeat)
+    reel = reels.create_reel_object(bpy.context, "reel", model, timeline)
+    show_points(reel)
+    for frame in [*random.uniform(-150, 150, 8), *random.integers(-100, 200, 4)]:
+        seek(frame)
+        time = timeline.time(bpy.context.scene.frame_current_final)
+        assert 2 / 40 <= time < 34 / 40
+        assert_same(evaluated(reel), model.evaluate(float(time)))
+
+
+def test_timeline_follows_its_formula() -> None:
+    """The stepwise float32 of `Timeline` against exact fractions, written from the documentation."""
+    random = np.random.default_rng(2)
+    for _ in range(300):
+        count = int(random.integers(1, 60))
+        first, last = sorted(int(i) for i in random.integers(0, count, 2))
+        speed, start, offset, frame = (Fraction(int(random.integers(-80, 80)), 8) for _ in range(4))
+        passed, steps = (frame - start) * speed + offset, last - first
+        turn = passed % (2 * steps) if steps else 0
+        expected = {
+            HOLD: min(max(passed, 0), steps),
+            LOOP: passed % (steps + 1),
+            PING_PONG: turn if turn <= steps else 2 * steps - turn,
+        }
+        for repeat, shown in expected.items():
+            timeline = Timeline(count, float(start), float(speed), float(offset), first, last, repeat)
+            assert float(timeline.reel_frame(float(frame))) == pytest.approx(float(first + shown), abs=1e-4)
+
+
+def test_each_frame_shows_itself(random_model: Model) -> None:
+    timeline = Timeline(24, start=1001)
+    for frame in range(24):
+        assert float(timeline.reel_frame(1001 + frame)) == frame
+        assert timeline.time(1001 + frame) == np.float32(frame) / np.float32(24)
+    assert timeline.reel_frame(0) == 0
+    assert timeline.reel_frame(2000) == 23
+
+
+def test_keyed_offset_chooses_frames(random_model: Model) -> None:
+    model = random_model(200)
+    reel = reels.create_reel_object(bpy.context, "reel", model, Timeline(10, speed=0.0))
+    modifier = show_points(reel)
+    for frame, offset in ((1, 0.0), (11, 8.0)):
+        compat.set_input(modifier, "Offset", offset)
+        reel.keyframe_insert(compat.input_path(modifier, "Offset"), frame=frame)
+    seek(11)
+    assert_same(evaluated(reel), model.evaluate(0.8))
+    seek(1)
+    assert_same(evaluated(reel), model.evaluate(0.0))
+
+
+def test_nothing_visible_is_no_error() -> None:
+    model = SpacetimeGaussians(
+        *(np.zeros(shape) for shape in ((3, 3), (3, 3, 3), (3, 4), (3, 4), (3, 3))),
+        opacity_logits=np.full(3, -30.0),
+        features=np.zeros((3, 3)),
+        trbf_centers=np.zeros(3),
+        trbf_log_scales=np.zeros(3),
+    )
+    reel = reels.create_reel_object(bpy.context, "reel", model, Timeline(10))
+    for look in LOOKS:
+        compat.set_input(reels.modifier_of(reel), "Look", look)
+        assert len(evaluated(reel)["position"]) == 0
+
+
+def test_scene_linear_is_the_srgb_curve(random_model: Model) -> None:
+    model = random_model(500)
+    model.features[:] = np.linspace(-0.1, 1.3, 1500).reshape(500, 3)
+    model.opacity_logits[:] = 4
+    model.trbf_log_scales[:] = 16
+    reel = reels.create_reel_object(bpy.context, "reel", model, Timeline(10))
+    show_points(reel, LINEAR)
+    values = model.features.astype(np.float64)
+    truth = np.where(values <= 0.04045, values / 12.92, (np.maximum(values + 0.055, 0) / 1.055) ** 2.4)
+    np.testing.assert_allclose(evaluated(reel)["rgb"][:, :3], truth, atol=2e-6)
+
+
+def test_reel_is_one_point_cloud_with_shared_groups(random_model: Model) -> None:
+    for index in range(3):
+        reel = reels.create_reel_object(bpy.context, f"reel {index}", random_model(50), Timeline(10))
+        assert (reel.type, len(reel.data.points), len(reel.modifiers)) == ("POINTCLOUD", 50, 1)
+        if index == 0:
+            groups, materials = len(bpy.data.node_groups), len(bpy.data.materials)
+    assert (len(bpy.data.node_groups), len(bpy.data.materials)) == (groups, materials)
+    assert len(bpy.data.objects) == 3
+    assert not bpy.data.meshes
+
+
+def test_groups_are_found_by_tag_not_name(random_model: Model) -> None:
+    first = reels.create_reel_object(bpy.context, "a", random_model(5), Timeline(10))
+    group = reels.modifier_of(first).node_group
+    group.name = "My own name"
+    second = reels.create_reel_object(bpy.context, "b", random_model(5), Timeline(10))
+    assert reels.modifier_of(second).node_group == group
+
+
+def test_every_input_explains_itself(random_model: Model) -> None:
+    reel = reels.create_reel_object(bpy.context, "reel", random_model(5), Timeline(10))
+    for item in reels.modifier_of(reel).node_group.interface.items_tree:
+        if item.item_type == "SOCKET" and item.in_out == "INPUT":
+            assert item.description, item.name
+
+
+def test_reel_survives_saving(random_model: Model, tmp_path: Path) -> None:
+    model = random_model(300)
+    timeline = Timeline(20, start=5, repeat=LOOP)
+    show_points(reels.create_reel_object(bpy.context, "reel", model, timeline))
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "scene.blend"))
+    bpy.ops.wm.read_factory_settings(use_empty=True)
+    bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "scene.blend"))
+    seek(37.5)
+    assert_same(evaluated(bpy.data.objects["reel"]), model.evaluate(float(timeline.time(37.5))))
+
+
+@pytest.mark.parametrize("count", [1, 50])
+def test_import_of_a_reel(count: int, random_model: Model, tmp_path: Path) -> None:
+    model = random_model(100)
+    path = tmp_path / "walk.reel"
+    save_gaussians(path, model, fps=25.0, frame_start=101, frame_count=count, up="-Y")
+    scene = bpy.context.scene
+    before = (scene.frame_start, scene.frame_end, scene.render.fps)
+    reel = reels.import_reel(bpy.context, path)
+    assert (scene.frame_start, scene.frame_end, scene.render.fps) == before
+    assert reel.name == "walk"
+    assert reel[reels.INFO]["source"] == str(path)
+    show_points(reel)
+    seek(101)
+    assert_same(evaluated(reel), model.evaluate(0.0))
+    bpy.context.view_layer.update()
+    up = reel.matrix_world.to_3x3() @ Vector((0, -1, 0))
+    assert tuple(round(v, 6) for v in up) == (0, 0, 1)
+
+
+@pytest.mark.parametrize("axis", list(reels.UPRIGHT))
+def test_every_axis_can_point_up(axis: str) -> None:
+    direction = np.eye(3)["XYZ".index(axis[-1])] * (-1 if axis.startswith("-") else 1)
+    np.testing.assert_allclose(np.array(reels.UPRIGHT[axis].to_3x3()) @ direction, [0, 0, 1], atol=1e-6)
+
+
+def test_real_time_and_scene_timing(random_model: Model, tmp_path: Path) -> None:
+    path = tmp_path / "walk.reel"
+    save_gaussians(path, random_model(20), fps=29.97, frame_start=11, frame_count=60)
+    scene = bpy.context.scene
+    scene.render.fps = 24
+    modifier = reels.modifier_of(reels.import_reel(bpy.context, path, pace=reels.REAL_TIME))
+    assert compat.get_input(modifier, "Speed") == pytest.approx(29.97 / 24)
+    modifier = reels.modifier_of(reels.import_reel(bpy.context, path, pace=reels.REAL_TIME, set_scene_timing=True))
+    assert compat.get_input(modifier, "Speed") == pytest.approx(1.0)
+    assert (scene.frame_start, scene.frame_end) == (11, 70)
+    assert scene.render.fps / scene.render.fps_base == pytest.approx(29.97)
+
+
+def test_refused_files_add_nothing(tmp_path: Path) -> None:
+    (tmp_path / "a.reel").write_text(json.dumps({"kind": "video"}))
+    (tmp_path / "b.ply").write_bytes(b"ply\nformat binary_little_endian 1.0\n")
+    (tmp_path / "c.splatv").write_bytes(b"\0" * 100)
+    for name in ("a.reel", "b.ply", "c.splatv", "absent.ply", "d.txt"):
+        with pytest.raises(HoloreelError, match=name):
+            reels.import_reel(bpy.context, tmp_path / name)
+    assert not bpy.data.objects
+    assert not bpy.data.node_groups
+
+
+@pytest.mark.parametrize("name", ["spinach_4", "yellow_clip2", "coffee10"])
+def test_real_models_evaluate_as_numpy_does(name: str, shared_data: Callable[[str], Path]) -> None:
+    path = shared_data(f"stg_splatv/{name}.splatv")
+    reel = reels.import_reel(bpy.context, path)
+    show_points(reel)
+    model = reels.load_gaussians(path).gaussians
+    for frame in (1, 13.37, 26):
+        seek(frame)
+        time = Timeline(50).time(bpy.context.scene.frame_current_final)
+        truth, shown = model.evaluate(float(time)), evaluated(reel)
+        alive = truth.take(truth.alive)
+        assert abs(len(alive) - len(shown["position"])) <= 1  # 1/255 itself may round either way
+        if len(alive) == len(shown["position"]):
+            assert_same(shown, truth)
