@@ -17,8 +17,8 @@ differentiable with respect to every tensor argument.
 
 Gaussians are drawn in the order of their camera-space z, rounded to single precision; equal ones in the order of their
 rows. A row is skipped, and gets zero gradient, where a parameter is not finite (but an infinite `trbf_log_scale` means
-always on), where the opacity at `time` is under `alpha_min`, or where its 2D covariance cannot be inverted. A quaternion
-of zero length means no rotation. Renderings are float32, or for `reference` of the dtype of the means.
+always on), where the opacity at `time` is under `alpha_min`, or where its 2D covariance cannot be inverted. A zero
+quaternion means no rotation. Renderings are float32, or for `reference` of the dtype of the means.
 """
 
 from dataclasses import dataclass

@@ -133,7 +133,7 @@ class _Rasterize(torch.autograd.Function):
         channels = arrays[PARAMETERS.index("features")].shape[1]  # type: ignore[union-attr]
         height, width = job.camera.height, job.camera.width
         pictures = (torch.empty(height, width, channels), torch.empty(height, width), torch.empty(height, width))
-        rest = torch.empty(height, width) if ctx.needs_input_grad[1] else None
+        rest = torch.empty(height, width)
         images = CImages(*map(_address, (*pictures, rest, background)))
         library = load_kernels()
         handle = library.holoreel_forward(job.c_gaussians(arrays), job.c_camera(), job.c_rules(), images)
@@ -169,6 +169,6 @@ class _Rasterize(torch.autograd.Function):
         if status != 0:
             raise HoloreelError(f"The gradient cannot be computed: {library.holoreel_last_error().decode()}.")
         background_gradient = None
-        if rest is not None and incoming[0] is not None:
+        if ctx.needs_input_grad[1] and incoming[0] is not None:
             background_gradient = torch.einsum("hwc,hw->c", incoming[0].double(), rest.double()).float()
         return None, background_gradient, *outgoing

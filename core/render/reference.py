@@ -6,7 +6,7 @@ tiles are taken in groups of about equal length, padded, and composited by a cum
 """
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import NamedTuple
 
 import torch
@@ -62,8 +62,8 @@ def rasterize(
     check_gaussians(means, quats, scales, opacities, features, background, density)
     with torch.no_grad():
         rows = torch.nonzero(_finite(means, quats, scales, features) & (opacities >= rules.alpha_min))[:, 0]
-    gaussians = Gaussians3D(*(array[rows] for array in (means, quats, scales, opacities, features)))
-    return _render(gaussians, rows, camera, background, rules, density)
+    arrays = (means, quats, scales, opacities, features)
+    return _render(lambda chosen: Gaussians3D(*(a[chosen] for a in arrays)), rows, camera, background, rules, density)
 
 
 def rasterize_spacetime(
@@ -84,8 +84,11 @@ def rasterize_spacetime(
         rows = torch.nonzero(finite)[:, 0]
         opacities = _opacities(g.opacity_logits[rows], time - g.trbf_centers[rows], g.trbf_log_scales[rows])
         rows = rows[opacities >= rules.alpha_min]
-    seen = SpacetimeTensors(*(array[rows] for array in g))
-    return _render(evaluate(seen, time, rules), rows, camera, background, rules, density)
+
+    def at_time(chosen: Tensor) -> Gaussians3D:
+        return evaluate(SpacetimeTensors(*(array[chosen] for array in g)), time, rules)
+
+    return _render(at_time, rows, camera, background, rules, density)
 
 
 def evaluate(g: SpacetimeTensors, time: float, rules: Rules | None = None) -> Gaussians3D:
@@ -254,14 +257,16 @@ def composite(splats: Splats, width: int, height: int, rules: Rules) -> Tensor:
 
 
 def _render(
-    gaussians: Gaussians3D,
+    gaussians_at: Callable[[Tensor], Gaussians3D],
     rows: Tensor,
     camera: Camera,
     background: Tensor | None,
     rules: Rules,
     density: DensityStats | None,
 ) -> Rendering:
-    splats = project(gaussians, rows, camera, rules)
+    with torch.no_grad():  # what cannot be drawn must not come near autograd: zero times infinity is NaN
+        rows = project(gaussians_at(rows), rows, camera, rules).rows
+    splats = project(gaussians_at(rows), rows, camera, rules)
     if density is not None:
         _watch_density(splats, camera, rules, density)
     sums = composite(splats, camera.width, camera.height, rules)

@@ -122,6 +122,8 @@ void backward(const HoloreelGaussians& g, const HoloreelCamera& camera, const Ho
     if (g.count != frame.count || g.channels != frame.channels || camera.width != frame.width ||
         camera.height != frame.height)
         throw std::invalid_argument("the backward pass got other arrays than the forward pass");
+    if (image_gradients.alpha && !images.transmittance)
+        throw std::invalid_argument("the gradient of alpha needs the transmittance");
     Stopwatch watch;
     const bool with_depth = image_gradients.depth && images.depth;
     TileJob job = job_of(frame, rules, images);

@@ -30,7 +30,7 @@ struct HoloreelGaussians {
 };
 
 // features (H, W, C), alpha (H, W), background (C) or null for black; depth and transmittance (H, W) or null. Transmittance
-// is 1 - alpha without the rounding, which matters where little is left of it.
+// is 1 - alpha without the rounding, which matters where little is left of it; the gradient of alpha needs it.
 struct HoloreelImages {
     float *features, *alpha, *depth, *transmittance;
     const float* background;

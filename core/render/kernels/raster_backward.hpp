@@ -46,7 +46,7 @@ struct PixelGradients {
                         g[c][lane] = job.grad_features[pixel * job.channels + c];
                         sum += static_cast<double>(g[c][lane]) * job.features[pixel * job.channels + c];
                     }
-                if (job.grad_alpha) sum -= static_cast<double>(job.grad_alpha[pixel]) * (1.0 - alpha);
+                if (job.grad_alpha) sum -= static_cast<double>(job.grad_alpha[pixel]) * job.transmittance[pixel];
                 s[lane] = static_cast<float>(sum);
                 if (kDepth && alpha > 0.0f) {
                     z[lane] = job.depth[pixel];
