@@ -158,9 +158,12 @@ def _converse(
     """
     assert child.stdin is not None
     assert child.stdout is not None
-    with suppress(BrokenPipeError):  # it died at once; what it printed says why
+    try:
         child.stdin.write(json.dumps(request) + "\n")
         child.stdin.flush()
+    except BrokenPipeError:  # it died at once; what it printed says why
+        with suppress(BrokenPipeError):
+            child.stdin.close()
     for line in child.stdout:
         event = _event(line)
         if event is None:
@@ -200,6 +203,4 @@ def _obituary(blender: Blender, status: int, log: Path) -> str:
         lines = deque((line.strip() for line in file if line.strip()), maxlen=_LOG_TAIL)
     last = next((line for line in reversed(lines) if "Error" in line or "error" in line), lines[-1] if lines else "")
     how = f"was ended by {signal.Signals(-status).name}" if status < 0 else f"stopped with status {status}"
-    if "No module named 'bpy'" in last:
-        return f"{blender.path} has no bpy: give a Python that has it, or the `blender` executable, with --blender."
     return f"Blender at {blender.path} {how}, last saying '{last[:200]}'; all it said is in {log}."

@@ -29,7 +29,11 @@ def serve() -> NoReturn:
         emit({"event": "error", "message": str(error), "mendable": True})
     except Exception as error:  # noqa: BLE001 - everything is reported, nothing is swallowed
         traceback.print_exc()
-        emit({"event": "error", "message": f"Blender failed with {type(error).__name__}: {error}", "mendable": False})
+        if isinstance(error, ModuleNotFoundError) and error.name == "bpy":
+            text = f"{sys.executable} has no bpy: give a Python that has it, or the blender executable, with --blender."
+        else:
+            text = f"Blender failed with {type(error).__name__}: {error}"
+        emit({"event": "error", "message": text, "mendable": False})
     sys.stderr.flush()
     os._exit(0)
 
