@@ -196,10 +196,14 @@ def _key_camera(scene: bpy.types.Scene, path: list[tuple[float, Camera]]) -> Non
 
 
 def _look_through_camera() -> None:
-    """Let every 3D viewport of the file show what the camera sees, rendered."""
+    """Let every 3D viewport of the file show what the camera sees, as EEVEE renders it.
+
+    Material Preview with the scene's world and lamps: Blender opens files in Solid where they were saved in Rendered.
+    """
     for screen in bpy.data.screens:
         for area in screen.areas:
             for space in area.spaces:
                 if space.type == "VIEW_3D":
-                    space.shading.type = "RENDERED"
+                    space.shading.type = "MATERIAL"
+                    space.shading.use_scene_world = space.shading.use_scene_lights = True
                     space.region_3d.view_perspective = "CAMERA"
