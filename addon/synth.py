@@ -31,7 +31,6 @@ def render(job: dict[str, Any], emit: Emit) -> dict[str, Any]:
     scene.frame_set(job["frames"][0])
     cameras = [Camera.from_json(camera) for camera in job["cameras"]] or place_rig(job, scene)
     emit({"event": "scene", "cameras": [camera.to_json() for camera in cameras], "scene": describe(scene)})
-    depth = "exact" if job["depth"] else "first sample" if job["seed_points"] else ""
     apply_look(scene, job)
     objects = make_cameras(scene, cameras)
     frame_now = None
@@ -43,6 +42,7 @@ def render(job: dict[str, Any], emit: Emit) -> dict[str, Any]:
         set_format(scene, cameras[index])
         scene.camera = objects[index]
         stem = Path(job["work"]) / f"{name}-{frame}"
+        depth = bool(job["depth"] or job["seed_points"])
         picture, layers = render_view(scene, stem, job["film"] == "transparent", depth)
         emit({"event": "view", "camera": name, "frame": frame, "picture": picture, "layers": layers})
     return {"rendered": len(job["todo"])}
@@ -152,14 +152,13 @@ def apply_look(scene: bpy.types.Scene, job: dict[str, Any]) -> None:
     for other in scene.view_layers:
         other.use = other == layer
     layer.samples = 0  # those of the scene
-    layer.use_pass_z = True
+    layer.use_pass_z = bool(job["depth"] or job["seed_points"])
 
 
-def render_view(scene: bpy.types.Scene, stem: Path, alpha: bool, depth: str) -> tuple[str, str | None]:
+def render_view(scene: bpy.types.Scene, stem: Path, alpha: bool, depth: bool) -> tuple[str, str | None]:
     """Render the active camera; return the picture's path and, with `depth`, that of an EXR with a depth pass.
 
-    Cycles takes depth from the first sample, which lies anywhere within the pixel filter: good enough for seed points.
-    "exact" depth is that of the pixel's center, and costs a render of one ray per pixel.
+    Cycles takes depth from the first sample, and sends that through the center of the pixel: depth is exact.
     """
     bpy.ops.render.render(write_still=False)
     result = bpy.data.images["Render Result"]
@@ -170,23 +169,7 @@ def render_view(scene: bpy.types.Scene, stem: Path, alpha: bool, depth: str) -> 
     result.save_render(picture, scene=scene)
     if not depth:
         return picture, None
-    if depth == "exact":
-        render_pixel_centers(scene)
     compat.set_image_format(settings, "OPEN_EXR_MULTILAYER")
     settings.color_depth, settings.exr_codec = "32", "NONE"  # read at once and deleted
     result.save_render(f"{stem}.exr", scene=scene)
     return picture, f"{stem}.exr"
-
-
-def render_pixel_centers(scene: bpy.types.Scene) -> None:
-    """Render one ray through the center of each pixel, without light, for passes that must not be sampled."""
-    cycles = scene.cycles
-    exact = {
-        "samples": 1, "pixel_filter_type": "BOX", "filter_width": 0.01, "use_denoising": False, "max_bounces": 0,
-    }  # fmt: skip
-    before = {key: getattr(cycles, key) for key in exact}
-    for key, value in exact.items():
-        setattr(cycles, key, value)
-    bpy.ops.render.render(write_still=False)
-    for key, value in before.items():
-        setattr(cycles, key, value)
