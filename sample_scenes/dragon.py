@@ -11,13 +11,12 @@ from pathlib import Path
 
 import bpy
 import numpy as np
-
 from holoreel.sample_scenes import kit
 
 FRAMES = 48
 SEED = 11
-TARGET = (0.0, 0.0, 0.95)
-CAMERA = {"distance": 7.2, "down_deg": 8.0, "lens": 42.0}
+TARGET = (0.0, 0.0, 1.0)
+CAMERA = {"distance": 7.1, "down_deg": 9.0, "lens": 42.0}
 STAGE_RADIUS = 1.95
 ROUND_FRAMES = 96
 START = 0.31  # where the dragon's neck is on its course at frame 0, as a share of the course
@@ -29,7 +28,7 @@ COLORS = {
     "cream": "#fdf0d6",
     "jade": "#4fa88e",
     "teal": "#2f7d86",
-    "plum": "#6d3f63",
+    "plum": "#5d4a80",
     "wine": "#8e3a4d",
     "ink": "#2b2b4d",
     "lilac": "#b9a5cf",
@@ -37,22 +36,33 @@ COLORS = {
     "rose": "#ec8f86",
     "pearl": "#d8f0e6",
 }
-GLOSSY = {"vermilion": 0.4, "gold": 0.32, "jade": 0.35, "plum": 0.35, "wine": 0.3, "pearl": 0.28}
+GLOSS = {"vermilion": 0.4, "gold": 0.32, "jade": 0.35, "plum": 0.35, "wine": 0.3, "pearl": 0.28}
+# fmt: off
+HILLS = (("far", 4.75, 1.0, "#8c73a4", 1.0), ("middle", 4.45, 0.7, "#5f6399", 3.0), ("near", 4.1, 0.45, "#3f6f86", 5.2))
+CLOUDS = (  # angle in degrees, radius, size
+    (-152, 2.25, 0.75), (-122, 2.4, 0.6), (-62, 2.4, 0.62), (-27, 2.25, 0.8), (28, 2.3, 0.9), (152, 2.3, 0.9),
+)
+LANTERNS = (  # x, y, z at frame 12, first frame, first frame without it, phase
+    (-2.05, 0.7, 0.9, -30, 60, 0.0), (1.95, 1.0, 1.25, -30, 60, 2.0), (1.0, 2.1, 1.9, -30, 60, 4.0),
+    (-1.55, 1.8, 1.35, 5, 60, 1.0), (0.15, 2.4, 2.05, -30, 9, 3.0), (2.3, 2.0, 0.9, 21, 60, 5.0),
+    (-2.5, 2.1, 1.8, -30, 33, 2.5),
+)
+BANNERS = (  # x, y, colors
+    (-1.72, 0.75, ("teal", "gold")), (1.72, 0.75, ("wine", "gold")),
+    (-1.2, 1.35, ("vermilion", "cream")), (1.2, 1.35, ("jade", "cream")),
+)
+PINWHEELS = (  # x, y, z, colors
+    (-1.5, -0.95, 0.78, ("rose", "gold")), (-1.05, -1.4, 0.62, ("jade", "cream")),
+    (1.5, -1.0, 0.74, ("gold", "vermilion")),
+)
+FIREWORKS = (  # x, y, z, first frame, first frame without it, color
+    (1.55, 2.7, 2.0, 5, 17, "rose"), (-2.2, 2.9, 1.45, -6, 9, "gold"), (0.6, 3.0, 2.35, 20, 34, "pearl"),
+    (-1.9, 2.8, 2.1, 30, 44, "rose"),
+)
+# fmt: on
 
 
-class Paints(dict):
-    """The scene's materials by name, made on first use."""
-
-    def __missing__(self, key: str) -> bpy.types.Material:
-        self[key] = kit.paint(key.title(), COLORS[key], roughness=GLOSSY.get(key, 0.8), grain=0.07)
-        return self[key]
-
-    def pick(self, *keys: str) -> list[bpy.types.Material]:
-        """Several paints at once."""
-        return [self[key] for key in keys]
-
-
-# ----------------------------------------------------------------------------------------------------------------- stage
+# ---------------------------------------------------------------------------------------------------------------- stage
 
 
 def paint_night(height_m: float, radius: float) -> np.ndarray:
@@ -82,49 +92,35 @@ def paint_ground(size: int = 768) -> np.ndarray:
         * 43758.5453
     )
     shade = 1 + 0.05 * (2 * (tile - np.floor(tile)) - 1) + 0.03 * noise
-    return kit.blend([(0.0, "#8c6f97"), (2.6, "#8c6f97"), (5.0, "#a1809c")], radius) * shade[..., None]
+    return kit.blend([(0.0, "#9a86ad"), (2.6, "#9a86ad"), (5.0, "#b392ab")], radius) * shade[..., None]
 
 
-def build_surroundings(paints: Paints) -> None:
+def build_surroundings(paints: kit.Paints) -> None:
     """Ground, painted night, a moon and three ranges of hills."""
     kit.curtain("Night", 5.0, 0.0, 4.4, [kit.mural("Painted night", paint_night(4.4, 5.0))])
     kit.ground("Ground", 5.0, [kit.mural("Tiled ground", paint_ground())])
     theta = kit.CURTAIN_ANGLES
-    ranges = (
-        ("far", 4.75, 1.0, "#8c73a4", 1.0),
-        ("middle", 4.45, 0.7, "#5f6399", 3.0),
-        ("near", 4.1, 0.45, "#3f6f86", 5.2),
-    )
-    for name, radius, height, color, phase in ranges:
+    for name, radius, height, color, phase in HILLS:
         crest = height * (1 + 0.3 * np.abs(np.sin(3.5 * theta + phase)) + 0.12 * np.sin(9 * theta + 2 * phase))
         kit.curtain(f"Hills {name}", radius, 0.0, crest, [kit.paint(f"Hills {name}", color, grain=0.07, scale=2.5)])
     moon = kit.empty("Moon", (-0.95, 3.5, 1.95))
-    kit.slab("Moon halo", kit.blob(0.78, []), 0.05, paints["gold"], upright=True, parent=moon, bevel=0.01)
-    kit.slab("Moon face", kit.blob(0.66, []), 0.12, paints["cream"], upright=True, parent=moon, bevel=0.02)
+    kit.plate("Moon halo", kit.blob(0.78), 0.05, paints["gold"], parent=moon, bevel=0.01)
+    kit.plate("Moon face", kit.blob(0.66), 0.12, paints["cream"], parent=moon, bevel=0.02)
     for number, (x, z, radius) in enumerate(((-0.2, 0.22, 0.16), (0.24, -0.05, 0.2), (-0.15, -0.27, 0.13)), 1):
         crater = kit.paint(f"Crater {number}", "#f0d9ae", grain=0.0)
-        kit.slab(f"Crater {number}", kit.blob(radius, [], 32), 0.14, crater, upright=True, parent=moon, at=(x, 0, z))
+        kit.plate(f"Crater {number}", kit.blob(radius, count=32), 0.14, crater, parent=moon, at=(x, 0, z))
 
 
-def build_stage(paints: Paints) -> None:
-    """A round lacquered stage on two steps, its top inlaid with petals, and clouds of paper about it."""
+def build_stage(paints: kit.Paints) -> None:
+    """A round lacquered stage on two steps with gilded edges, its top inlaid with slowly turning petals."""
     for name, radius, low, high, color in (
         ("Lower step", 2.2, 0.0, 0.12, "wine"),
         ("Upper step", STAGE_RADIUS, 0.1, 0.3, "plum"),
     ):
         kit.lathe(name, [(radius, low), (radius, high)], [paints[color]], segments=80, smooth=False, bevel=0.02)
-        kit.lathe(
-            f"{name} rim",
-            [
-                (radius - 0.06, high - 0.02),
-                (radius + 0.012, high - 0.02),
-                (radius + 0.012, high + 0.012),
-                (radius - 0.06, high + 0.012),
-            ],
-            [paints["gold"]],
-            segments=80,
-            smooth=False,
-        )
+        edge = [(radius - 0.09, high - 0.02), (radius + 0.015, high - 0.02), (radius + 0.015, high + 0.02)]
+        edge.append((radius - 0.09, high + 0.02))
+        kit.lathe(f"{name} rim", edge, [paints["gold"]], segments=80, ring=True, smooth=False)
     carousel = kit.empty("Medallion", (0, 0, 0.3))
     kit.drive(carousel, "rotation_euler", kit.turn(2 * FRAMES), 2)
     for ring, (count, reach, size, colors) in enumerate(
@@ -143,33 +139,23 @@ def build_stage(paints: Paints) -> None:
             )
             plate.rotation_euler[2] = angle
     kit.slab("Medallion heart", kit.blob(0.42, [(6, 0.08, 0.0)]), 0.05, paints["cream"], parent=carousel, bevel=0.01)
-    for number, (angle_deg, radius, size) in enumerate(
-        ((-160, 2.0, 0.75), (-128, 2.15, 0.55), (-52, 2.15, 0.55), (-20, 2.0, 0.8), (40, 2.1, 0.8), (140, 2.1, 0.85)), 1
-    ):
+
+
+def build_clouds(paints: kit.Paints) -> None:
+    """Paper clouds in three layers that the stage floats among; the layers slide past each other."""
+    for number, (angle_deg, radius, size) in enumerate(CLOUDS, 1):
         angle = math.radians(angle_deg)
-        outline = [(size * x, size * z) for x, z in kit.cloud_outline()]
-        for layer, color in enumerate(("mist", "lilac", "cream")):
-            grow = 1.15 - 0.2 * layer
-            cloud = kit.slab(
-                f"Cloud {number}.{layer + 1}",
-                [(grow * x, grow * z) for x, z in outline],
-                0.07,
-                paints[color],
-                upright=True,
-                bevel=0.012,
-            )
-            reach = radius + 0.25 - 0.09 * layer
-            cloud.location = (reach * math.cos(angle), reach * math.sin(angle), 0.06)
-            cloud.rotation_euler[2] = angle + math.pi / 2 if angle_deg < 0 else angle - math.pi / 2
-            kit.drive(
-                cloud,
-                "location",
-                f"{reach * math.cos(angle):.4f}+{0.02 + 0.03 * layer}*sin{kit.turn(FRAMES, number + layer)}",
-                0,
-            )
+        bank = kit.empty(f"Cloud bank {number}", (radius * math.cos(angle), radius * math.sin(angle), 0.05))
+        bank.rotation_euler[2] = 0.4 * (angle + math.pi / 2) if angle_deg < 0 else 0.0
+        for layer, (color, grow) in enumerate((("mist", 1.15), ("lilac", 0.95), ("cream", 0.72))):
+            outline = [(grow * size * x, grow * size * z) for x, z in kit.cloud_outline()]
+            shift = size * 0.2 * (layer - 1) * (-1) ** number
+            cloud = kit.plate(f"Cloud {number}.{layer + 1}", outline, 0.07, paints[color], bevel=0.012)
+            cloud.parent, cloud.location[1] = bank, -0.1 * layer
+            kit.move(cloud, place=(f"{shift:.4f}+{0.02 + 0.03 * layer}*sin{kit.turn(FRAMES, number + layer)}",))
 
 
-# ---------------------------------------------------------------------------------------------------------------- dragon
+# --------------------------------------------------------------------------------------------------------------- dragon
 
 
 def build_course() -> tuple[bpy.types.Object, float]:
@@ -194,7 +180,7 @@ def course(t: np.ndarray) -> np.ndarray:
     return np.c_[1.42 * np.sin(t), 0.62 * np.sin(2 * t), 1.22 + 0.36 * np.cos(t) + 0.08 * np.cos(2 * t + 0.6)]
 
 
-def build_dragon(paints: Paints) -> None:
+def build_dragon(paints: kit.Paints) -> None:
     """The dragon: straight parts along X, all bent along the course by Curve modifiers as their parent moves on."""
     path, length = build_course()
     dragon = kit.empty("Dragon")
@@ -212,7 +198,7 @@ def body_radius(x: np.ndarray) -> np.ndarray:
     return 0.03 + 0.15 * np.sin(np.pi * np.clip(u, 0, 1) ** 0.75 * 0.82) ** 0.8
 
 
-def build_body(paints: Paints, dragon: bpy.types.Object) -> list[bpy.types.Object]:
+def build_body(paints: kit.Paints, dragon: bpy.types.Object) -> list[bpy.types.Object]:
     """A ringed body with a crest, legs and a tail flame; body and crest undulate as one."""
     x = np.linspace(-BODY_LENGTH, 0.06, 121)
     radius = body_radius(x) * (1 + 0.05 * np.cos(2 * np.pi * np.arange(len(x)) / 4))
@@ -273,18 +259,16 @@ def undulate(thing: bpy.types.Object) -> None:
     """A wave that runs from the neck to the tail, growing as it goes."""
     x = np.array([v.co.x for v in thing.data.vertices])
     grow = 0.09 * np.clip(-x / BODY_LENGTH, 0, 1) ** 0.7 * np.clip(x + BODY_LENGTH, 0, 1)
-    lift = np.zeros((2, len(x), 3))
-    lift[0, :, 2], lift[1, :, 2] = grow * np.cos(5 * x), grow * np.sin(5 * x)
-    kit.wave_keys(thing, lift[0], lift[1], 24)
+    kit.traveling_wave(thing, 2, grow, -5 * x, 24)
 
 
-def build_head(paints: Paints, dragon: bpy.types.Object) -> list[bpy.types.Object]:
+def build_head(paints: kit.Paints, dragon: bpy.types.Object) -> list[bpy.types.Object]:
     """A toy head with a ruff, horns, ears and a snapping jaw."""
-    star = [(r * math.cos(a), r * math.sin(a)) for i in range(28) for r, a in [((0.33, 0.24)[i % 2], i * math.pi / 14)]]
-    ruff = kit.slab("Dragon ruff", star, 0.06, paints["gold"], parent=dragon, at=(0.0, 0, 0.02), bevel=0.01)
+    tips = kit.star(0.33, 0.24, 14)
+    ruff = kit.slab("Dragon ruff", tips, 0.06, paints["gold"], parent=dragon, at=(0.0, 0, 0.02), bevel=0.01)
     inner = kit.slab(
         "Dragon ruff inner",
-        [(0.78 * x, 0.78 * y) for x, y in star],
+        [(0.78 * x, 0.78 * y) for x, y in tips],
         0.06,
         paints["jade"],
         parent=dragon,
@@ -324,7 +308,7 @@ def build_head(paints: Paints, dragon: bpy.types.Object) -> list[bpy.types.Objec
     return parts
 
 
-def build_pearl(paints: Paints, dragon: bpy.types.Object) -> bpy.types.Object:
+def build_pearl(paints: kit.Paints, dragon: bpy.types.Object) -> bpy.types.Object:
     """The striped pearl that rolls ahead of the dragon's nose."""
     profile = kit.ball_profile(0.17, 14)
     stripes = paints.pick("pearl", "teal")
@@ -337,110 +321,71 @@ def build_pearl(paints: Paints, dragon: bpy.types.Object) -> bpy.types.Object:
     return pearl
 
 
-# --------------------------------------------------------------------------------------------------------------- festival
+# ------------------------------------------------------------------------------------------------------------- festival
 
 
-def build_lanterns(paints: Paints) -> None:
+def build_lanterns(paints: kit.Paints) -> None:
     """Sky lanterns that rise on winding ways; one is lit at frame 5, another is gone by frame 9."""
     shade = kit.glow("Lantern paper", "#ffb45e", 0.55)
-    places = (
-        (-2.05, 0.7, 0.9, -30, 60, 0.0), (1.95, 1.0, 1.25, -30, 60, 2.0), (1.0, 2.1, 1.9, -30, 60, 4.0),
-        (-1.55, 1.8, 1.35, 5, 60, 1.0), (0.15, 2.4, 2.05, -30, 9, 3.0), (2.3, 2.0, 0.9, 21, 60, 5.0), (-2.5, 2.1, 1.8, -30, 33, 2.5),
-    )  # fmt: skip
     profile = [(0.1, -0.19), (0.15, -0.13), (0.19, 0.0), (0.2, 0.1), (0.16, 0.17), (0.05, 0.2)]
-    for number, (x, y, z, lit, gone, phase) in enumerate(places, 1):
+    for number, (x, y, z, lit, gone, phase) in enumerate(LANTERNS, 1):
         lantern = kit.lathe(
             f"Lantern {number}",
             profile,
-            [shade, *paints.pick("vermilion")],
+            [shade, paints["vermilion"]],
             segments=12,
-            slot=lambda ring, i: 1 if ring in (0, 4) else 0,
+            slot=lambda ring, _: int(ring in (0, 4)),
             smooth=False,
-            at=(x, y, z),
             bevel=0.008,
         )
-        kit.drive(lantern, "location", f"{x}+0.12*sin{kit.turn(FRAMES, phase)}", 0)
-        kit.drive(lantern, "location", f"{y}+0.08*cos{kit.turn(FRAMES, phase)}", 1)
-        kit.drive(lantern, "location", f"{z}+0.011*(frame-12)", 2)
-        kit.drive(lantern, "rotation_euler", kit.turn(96, phase), 2)
+        sway = kit.turn(FRAMES, phase)
+        kit.move(
+            lantern,
+            place=(f"{x}+0.12*sin{sway}", f"{y}+0.08*cos{sway}", f"{z}+0.011*(frame-12)"),
+            spin=("", "", kit.turn(96, phase)),
+        )
         kit.pop(lantern, [(lit - 1, 0.0), (lit, 0.5), (lit + 2, 1.0), (gone - 2, 1.0), (gone - 1, 0.6), (gone, 0.0)])
 
 
-def build_banners(paints: Paints) -> None:
+def build_banners(paints: kit.Paints) -> None:
     """Long banners on poles at both sides, waving."""
-    for number, (x, y, colors) in enumerate(
-        (
-            (-1.72, 0.75, ("teal", "gold")),
-            (1.72, 0.75, ("wine", "gold")),
-            (-1.2, 1.35, ("vermilion", "cream")),
-            (1.2, 1.35, ("jade", "cream")),
-        ),
-        1,
-    ):
+    for number, (x, y, colors) in enumerate(BANNERS, 1):
         pole = kit.lathe(f"Pole {number}", [(0.035, 0.28), (0.03, 1.9)], [paints["gold"]], segments=12, at=(x, y, 0))
         kit.ball(f"Pole tip {number}", 0.07, paints["vermilion"], at=(0, 0, 1.93), parent=pole)
         away = 1.0 if x > 0 else -1.0
         u, v = np.meshgrid(np.linspace(0, 1, 25), np.linspace(0, 1, 17))
-        rows = np.stack(
-            [away * (0.02 + 0.62 * u), 0 * u, 1.82 - 0.5 * v - 0.12 * u + 0.1 * u * (2 * v - 1) * (u - 0.6)], -1
-        )
+        fall = 1.82 - 0.5 * v - 0.12 * u + 0.1 * u * (2 * v - 1) * (u - 0.6)
+        rows = np.stack([away * (0.02 + 0.62 * u), 0 * u, fall], -1)
         slots = np.where((np.arange(16) < 3) | (np.arange(16) > 12), 1, 0)
         flag = kit.strip(f"Banner {number}", rows, paints.pick(*colors), slots=slots, smooth=True, parent=pole)
-        phase = 7 * u.ravel() + 1.2 * v.ravel() + number
-        wave = np.zeros((2, u.size, 3))
-        wave[0, :, 1], wave[1, :, 1] = -0.11 * u.ravel() * np.cos(phase), 0.11 * u.ravel() * np.sin(phase)
-        kit.wave_keys(flag, wave[0], wave[1], 16)
+        kit.traveling_wave(flag, 1, 0.11 * u.ravel(), (7 * u + 1.2 * v + number).ravel(), 16)
 
 
-def build_pinwheels(paints: Paints) -> None:
+def build_pinwheels(paints: kit.Paints) -> None:
     """Pinwheels in front that spin 135 degrees in 12 frames, left and right by turns."""
-    for number, (x, y, z, colors) in enumerate(
-        (
-            (-1.5, -0.95, 0.78, ("rose", "gold")),
-            (-1.05, -1.4, 0.62, ("jade", "cream")),
-            (1.5, -1.0, 0.74, ("gold", "vermilion")),
-        ),
-        1,
-    ):
+    leaf_outline = [(0.0, 0.0), (0.13, 0.07), (0.09, 0.2), (0.0, 0.27)]
+    for number, (x, y, z, colors) in enumerate(PINWHEELS, 1):
         kit.lathe(f"Stick {number}", [(0.022, 0.28), (0.018, z)], [paints["cream"]], segments=10, at=(x, y, 0))
         wheel = kit.empty(f"Pinwheel {number}", (x, y - 0.05, z))
-        kit.drive(wheel, "rotation_euler", kit.turn(32 if number % 2 else -32, number), 1)
+        kit.move(wheel, spin=("", kit.turn(32 if number % 2 else -32, number)))
         for blade in range(6):
-            leaf = kit.slab(
-                f"Pinwheel leaf {number}.{blade + 1}",
-                [(0.0, 0.0), (0.13, 0.07), (0.09, 0.2), (0.0, 0.27)],
-                0.02,
-                paints[colors[blade % 2]],
-                upright=True,
-                parent=wheel,
-            )
+            color = paints[colors[blade % 2]]
+            leaf = kit.plate(f"Pinwheel leaf {number}.{blade + 1}", leaf_outline, 0.02, color, parent=wheel)
             leaf.rotation_euler = (0.0, blade * math.pi / 3, 0.0)
         kit.ball(f"Pinwheel hub {number}", 0.05, paints["wine"], at=(0, -0.03, 0), parent=wheel)
 
 
-def build_fireworks(paints: Paints) -> None:
+def build_fireworks(paints: kit.Paints) -> None:
     """Paper fireworks that burst open, turn a little and are gone."""
-    bursts = (
-        (1.55, 2.7, 2.0, 5, 17, "rose"),
-        (-2.2, 2.9, 1.45, -6, 9, "gold"),
-        (0.6, 3.0, 2.35, 20, 34, "pearl"),
-        (-1.9, 2.8, 2.1, 30, 44, "rose"),
-    )
-    for number, (x, y, z, born, gone, color) in enumerate(bursts, 1):
+    for number, (x, y, z, born, gone, color) in enumerate(FIREWORKS, 1):
         burst = kit.empty(f"Firework {number}", (x, y, z))
-        kit.drive(burst, "rotation_euler", kit.turn(144, number), 1)
+        kit.move(burst, spin=("", kit.turn(144, number)))
         kit.pop(burst, [(born - 1, 0.1), (born, 0.35), (born + 3, 0.9), (gone - 2, 1.1), (gone, 0.5)])
         for ray in range(12):
             angle, reach = ray * math.pi / 6, (0.4, 0.3)[ray % 2]
             outline = [(-0.025, 0.13), (0.025, 0.13), (0.05, reach), (0.0, reach + 0.07), (-0.05, reach)]
-            spark = kit.slab(
-                f"Spark {number}.{ray + 1:02d}",
-                outline,
-                0.03,
-                paints[(color, "cream")[ray % 2]],
-                upright=True,
-                parent=burst,
-            )
+            paper = paints[(color, "cream")[ray % 2]]
+            spark = kit.plate(f"Spark {number}.{ray + 1:02d}", outline, 0.03, paper, parent=burst)
             spark.rotation_euler[1] = angle
             kit.pop(spark, [(born - 1, 0.0), (born, 1.0), (gone - 1, 1.0), (gone, 0.0)])
 
@@ -448,16 +393,17 @@ def build_fireworks(paints: Paints) -> None:
 def build() -> bpy.types.Scene:
     """Build the whole scene in the running Blender and return it."""
     scene = kit.start(FRAMES)
-    paints = Paints()
+    paints = kit.Paints(COLORS, GLOSS)
     build_surroundings(paints)
     build_stage(paints)
+    build_clouds(paints)
     build_dragon(paints)
     build_lanterns(paints)
     build_banners(paints)
     build_pinwheels(paints)
     build_fireworks(paints)
     kit.sky(scene, "#f0c9d4", "#9fb2ea", 0.7)
-    kit.sun("#ffe6cf", 2.3, 42, 34, 10)
+    kit.sun("#ffe9d2", 2.9, 40, 30, 10)
     kit.camera(scene, TARGET, **CAMERA)
     scene.frame_set(1)
     return scene

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Small tools the sample scenes are built with: shapes, paints, motions, light and camera.
+"""Small tools the sample scenes are built with: paints, shapes, motions, light and camera.
 
-Runs inside Blender (bpy 4.5 or 5.x). Lengths are meters, angles radians unless a name says otherwise, Z is up, colors are
-sRGB hex strings. Motion is closed-form drivers in `frame` (Blender evaluates these without running Python, so they also play
-where auto-execution is off) and plain keyframes: nothing to bake, no caches, exact at sub-frames.
+Runs inside Blender (bpy 4.5 or 5.x). Lengths are meters, angles radians unless a name says otherwise, Z is up, colors
+are sRGB hex strings. Motion is closed-form drivers in `frame` (Blender evaluates these without running Python, so they
+also play where auto-execution is off) and plain keyframes: nothing to bake, no caches, exact at sub-frames.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ def linear_rgb(color: str) -> tuple[float, float, float]:
     return red, green, blue
 
 
-# ---------------------------------------------------------------------------------------------------------------- paints
+# --------------------------------------------------------------------------------------------------------------- paints
 
 
 def paint(
@@ -61,8 +61,25 @@ def paint(
     return material
 
 
+class Paints(dict[str, bpy.types.Material]):
+    """A scene's materials by name, mixed on first use."""
+
+    def __init__(self, colors: dict[str, str], gloss: dict[str, float]) -> None:
+        """Take the colors by name, and the roughness of those that shine."""
+        super().__init__()
+        self.colors, self.gloss = colors, gloss
+
+    def __missing__(self, name: str) -> bpy.types.Material:
+        self[name] = paint(name.title(), self.colors[name], roughness=self.gloss.get(name, 0.8), grain=0.08)
+        return self[name]
+
+    def pick(self, *names: str) -> list[bpy.types.Material]:
+        """Several paints at once."""
+        return [self[name] for name in names]
+
+
 def mural(name: str, srgb: np.ndarray, *, roughness: float = 0.9) -> bpy.types.Material:
-    """A material showing a picture, (H, W, 3) sRGB in [0, 1], top row first, packed into the .blend and laid out by UV."""
+    """A material showing a picture by UV: (H, W, 3) sRGB in [0, 1], top row first, packed into the .blend."""
     height, width, _ = srgb.shape
     image = bpy.data.images.new(name, width, height)
     rgba = np.ones((height, width, 4), np.float32)
@@ -108,7 +125,7 @@ def blend(stops: list[tuple[float, str]], where: np.ndarray) -> np.ndarray:
     return np.stack([np.interp(where, positions, rgb[:, c]) for c in range(3)], -1)
 
 
-# ---------------------------------------------------------------------------------------------------------------- shapes
+# --------------------------------------------------------------------------------------------------------------- shapes
 
 
 def add_mesh(
@@ -158,7 +175,7 @@ def empty(name: str, at: Point = (0, 0, 0), parent: bpy.types.Object | None = No
 def slab(
     name: str, outline: Outline, thickness: float, material: bpy.types.Material, *, upright: bool = False, **options
 ) -> bpy.types.Object:
-    """A plate cut along a closed outline (counter-clockwise): lying on z = 0, or `upright`, facing -Y and centered on it."""
+    """A plate cut along a counter-clockwise outline: lying on z = 0, or `upright`, facing -Y and centered on y = 0."""
     count = len(outline)
     flat = np.asarray(outline, float)
     low, high = (np.full(count, h) for h in ((-thickness / 2, thickness / 2) if upright else (0.0, thickness)))
@@ -172,6 +189,11 @@ def slab(
     return add_mesh(name, vertices, caps + sides, [material], **options)
 
 
+def plate(name: str, outline: Outline, thickness: float, material: bpy.types.Material, **options) -> bpy.types.Object:
+    """A slab standing upright, facing the front camera."""
+    return slab(name, outline, thickness, material, upright=True, **options)
+
+
 def lathe(
     name: str,
     profile: Outline,
@@ -179,26 +201,28 @@ def lathe(
     *,
     segments: int = 32,
     slot: Callable[[int, int], int] = lambda ring, segment: 0,
-    squash: tuple[float, float] = (1.0, 1.0),
+    ring: bool = False,
     smooth: bool = True,
     **options,
 ) -> bpy.types.Object:
-    """Turn a profile of (radius, z), bottom to top, about Z; `slot(ring, segment)` picks each face's material."""
+    """Turn a profile of (radius, z), bottom to top, about Z; `slot(ring, segment)` picks each face's material.
+
+    Both ends are capped, unless the profile is closed (counter-clockwise) into a `ring`.
+    """
+    profile = [*profile, profile[0]] if ring else profile
     angle = np.linspace(0, 2 * np.pi, segments, endpoint=False)
-    vertices = [
-        (radius * squash[0] * math.cos(a), radius * squash[1] * math.sin(a), z) for radius, z in profile for a in angle
-    ]
+    vertices = [(radius * math.cos(a), radius * math.sin(a), z) for radius, z in profile for a in angle]
     faces, slots = [], []
-    for ring in range(len(profile) - 1):
+    for row in range(len(profile) - 1):
+        low, high = row * segments, (row + 1) * segments
         for i in range(segments):
             j = (i + 1) % segments
-            faces.append(
-                (ring * segments + i, ring * segments + j, (ring + 1) * segments + j, (ring + 1) * segments + i)
-            )
-            slots.append(slot(ring, i))
-    last = (len(profile) - 1) * segments
-    faces += [tuple(range(segments))[::-1], tuple(range(last, last + segments))]
-    slots += [slot(0, 0), slot(len(profile) - 2, 0)]
+            faces.append((low + i, low + j, high + j, high + i))
+            slots.append(slot(row, i))
+    if not ring:
+        last = (len(profile) - 1) * segments
+        faces += [tuple(range(segments))[::-1], tuple(range(last, last + segments))]
+        slots += [slot(0, 0), slot(len(profile) - 2, 0)]
     return add_mesh(name, vertices, faces, materials, slots=slots, smooth=smooth, **options)
 
 
@@ -222,7 +246,13 @@ def box(name: str, size: Point, material: bpy.types.Material, **options) -> bpy.
     return slab(name, [(-x, -y), (x, -y), (x, y), (-x, y)], z, material, **options)
 
 
-def blob(radius: float, wobble: Sequence[tuple[int, float, float]], count: int = 64) -> list[tuple[float, float]]:
+def star(outer: float, inner: float, points: int) -> list[tuple[float, float]]:
+    """The outline of a star."""
+    tips = [((outer, inner)[i % 2], i * math.pi / points) for i in range(2 * points)]
+    return [(r * math.cos(a), r * math.sin(a)) for r, a in tips]
+
+
+def blob(radius: float, wobble: Sequence[tuple[int, float, float]] = (), count: int = 64) -> list[tuple[float, float]]:
     """A round outline with a few harmonics (order, relative size, phase)."""
     angle = np.linspace(0, 2 * np.pi, count, endpoint=False)
     r = radius * (1 + sum(size * np.cos(order * angle + phase) for order, size, phase in wobble))
@@ -273,7 +303,7 @@ def cloud_outline() -> list[tuple[float, float]]:
     return [*zip(x, np.full_like(x, -0.06), strict=True), *zip(x[::-1], top[::-1], strict=True)]
 
 
-# --------------------------------------------------------------------------------------------------------------- motions
+# -------------------------------------------------------------------------------------------------------------- motions
 
 
 def drive(owner: bpy.types.ID | bpy.types.ShapeKey, path: str, expression: str, index: int = -1) -> None:
@@ -289,7 +319,7 @@ def turn(period: float, phase: float = 0.0) -> str:
 
 
 def wave_keys(thing: bpy.types.Object, sine: np.ndarray, cosine: np.ndarray, period: float, phase: float = 0.0) -> None:
-    """Deform a mesh by `sine`·sin + `cosine`·cos of time, offsets (vertices, 3): a traveling wave from two shape keys."""
+    """Deform a mesh by `sine`·sin + `cosine`·cos of time, offsets (vertices, 3): two shape keys, one traveling wave."""
     rest = np.array([v.co for v in thing.data.vertices])
     thing.shape_key_add(name="Rest")
     for name, offset, function in (("Sine", sine, "sin"), ("Cosine", cosine, "cos")):
@@ -297,6 +327,23 @@ def wave_keys(thing: bpy.types.Object, sine: np.ndarray, cosine: np.ndarray, per
         key.data.foreach_set("co", (rest + offset).astype(np.float32).ravel())
         key.slider_min = -1.0
         drive(key, "value", f"{function}{turn(period, phase)}")
+
+
+def traveling_wave(
+    thing: bpy.types.Object, axis: int, height: np.ndarray | float, argument: np.ndarray, period: float
+) -> None:
+    """Move vertices along an axis by `height`·sin(`argument` - time), with one value of both per vertex."""
+    offsets = np.zeros((2, len(argument), 3))
+    offsets[0, :, axis], offsets[1, :, axis] = -height * np.cos(argument), height * np.sin(argument)
+    wave_keys(thing, offsets[0], offsets[1], period)
+
+
+def move(thing: bpy.types.Object, *, place: Sequence[str] = (), spin: Sequence[str] = ()) -> None:
+    """Drive location and Euler angles by expressions in `frame`, (x, y, z) each; an empty text leaves an axis alone."""
+    for path, expressions in (("location", place), ("rotation_euler", spin)):
+        for axis, expression in enumerate(expressions):
+            if expression:
+                drive(thing, path, expression, axis)
 
 
 def pop(thing: bpy.types.Object, scales: Sequence[tuple[int, float]]) -> None:
@@ -309,7 +356,7 @@ def pop(thing: bpy.types.Object, scales: Sequence[tuple[int, float]]) -> None:
         thing.keyframe_insert("hide_viewport", frame=frame)
 
 
-# ------------------------------------------------------------------------------------------------------- light and camera
+# ----------------------------------------------------------------------------------------------------- light and camera
 
 
 def start(frames: int = 48) -> bpy.types.Scene:
