@@ -45,6 +45,13 @@ def check_spacetime(gaussians: SpacetimeTensors, background: Tensor | None, dens
     _check_rest(count, g.features, background, density)
 
 
+def check_images(image: Tensor, target: Tensor) -> None:
+    """Raise ValueError unless both are (H, W, C), of one size and not empty."""
+    if image.ndim != 3 or image.numel() == 0:
+        raise ValueError(f"image has shape {tuple(image.shape)}, not (H, W, C)")
+    _check_shapes(target=(target, tuple(image.shape)))
+
+
 def _check_shapes(**expected: tuple[Tensor, tuple[int, ...]]) -> None:
     for name, (tensor, shape) in expected.items():
         if tuple(tensor.shape) != shape:

@@ -11,7 +11,7 @@ from torch.autograd.function import once_differentiable
 
 from ..camera import Camera
 from ..errors import HoloreelError
-from .checks import check_gaussians, check_spacetime
+from .checks import check_gaussians, check_images, check_spacetime
 from .contract import DensityStats, Rendering, Rules, SpacetimeTensors
 from .native import (
     PARAMETERS,
@@ -29,7 +29,16 @@ from .native import (
     set_threads,
 )
 
-__all__ = ["get_threads", "load_kernels", "rasterize", "rasterize_spacetime", "set_lanes", "set_threads"]
+__all__ = [
+    "adam_step",
+    "get_threads",
+    "l1_dssim",
+    "load_kernels",
+    "rasterize",
+    "rasterize_spacetime",
+    "set_lanes",
+    "set_threads",
+]
 
 
 def rasterize(
@@ -172,3 +181,57 @@ class _Rasterize(torch.autograd.Function):
         if ctx.needs_input_grad[1] and incoming[0] is not None:
             background_gradient = torch.einsum("hwc,hw->c", incoming[0].double(), rest.double()).float()
         return None, background_gradient, *outgoing
+
+
+def l1_dssim(image: Tensor, target: Tensor, weight_dssim: float) -> Tensor:
+    """Return (1 - w) mean|image - target| + w (1 - mean SSIM) of two (H, W, C) images, a scalar.
+
+    SSIM has an 11 x 11 Gaussian window of sigma 1.5, zeros beyond the border, C1 = 0.01² and C2 = 0.03². Differentiable
+    with respect to `image`; at equal values the gradient of L1 is 0.
+    """
+    check_images(image, target)
+    return _L1Dssim.apply(_plain(image), _plain(target), float(weight_dssim))
+
+
+class _L1Dssim(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, image: Tensor, target: Tensor, weight: float) -> Tensor:
+        # The gradient comes almost for free with the value, so it is taken at once.
+        gradient = torch.empty_like(image) if ctx.needs_input_grad[0] else None
+        loss = ctypes.c_double()
+        library = load_kernels()
+        height, width, channels = image.shape
+        pointers = _address(image), _address(target)
+        if library.holoreel_l1_dssim(*pointers, height, width, channels, weight, loss, _address(gradient)) != 0:
+            raise HoloreelError(f"The loss cannot be computed: {library.holoreel_last_error().decode()}.")
+        ctx.gradient = gradient
+        return torch.tensor(loss.value, dtype=torch.float32)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, None, None]:
+        return (None if ctx.gradient is None else ctx.gradient * gradient), None, None
+
+
+def adam_step(
+    param: Tensor,
+    grad: Tensor,
+    exp_avg: Tensor,
+    exp_avg_sq: Tensor,
+    lr: float,
+    beta1: float,
+    beta2: float,
+    eps: float,
+    step: int,
+) -> None:
+    """Take one step of Adam, in place, as `torch.optim.Adam` does. `step` counts from 1.
+
+    All four tensors are float32, contiguous and of one shape.
+    """
+    tensors = (param, grad, exp_avg, exp_avg_sq)
+    for tensor in tensors:
+        if tensor.shape != param.shape or tensor.dtype != torch.float32 or not tensor.is_contiguous():
+            raise ValueError("adam_step needs contiguous float32 tensors of one shape")
+    if step < 1:
+        raise ValueError("adam_step counts steps from 1")
+    load_kernels().holoreel_adam_step(*map(_address, tensors), param.numel(), lr, beta1, beta2, eps, step)

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from ..errors import HoloreelError
 
-ABI = 3  # HOLOREEL_ABI in kernels/api.hpp
+ABI = 4  # HOLOREEL_ABI in kernels/api.hpp
 
 
 class CCamera(Structure):
@@ -111,6 +111,11 @@ _SIGNATURES = {
             POINTER(CGradients),
         ),
     ),
+    "holoreel_l1_dssim": (
+        c_int,
+        (c_void_p, c_void_p, c_int, c_int, c_int, c_double, POINTER(c_double), c_void_p),
+    ),
+    "holoreel_adam_step": (c_int, (*[c_void_p] * 4, c_int64, *[c_double] * 4, c_int64)),
     "holoreel_frame_free": (None, (c_void_p,)),
     "holoreel_frame_intersections": (c_int64, (c_void_p,)),
     "holoreel_frame_visible": (c_int64, (c_void_p,)),

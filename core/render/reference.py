@@ -14,7 +14,7 @@ from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
 from ..camera import Camera
-from .checks import check_gaussians, check_spacetime
+from .checks import check_gaussians, check_images, check_spacetime
 from .contract import DensityStats, Rendering, Rules, SpacetimeTensors
 
 TILE = 16
@@ -295,3 +295,41 @@ def _watch_density(splats: Splats, camera: Camera, rules: Rules, density: Densit
         density.radius_px[rows] = torch.maximum(density.radius_px[rows], radii)
 
     splats.means.register_hook(add)
+
+
+def l1_dssim(image: Tensor, target: Tensor, weight_dssim: float) -> Tensor:
+    """Return (1 - w) mean|image - target| + w (1 - mean SSIM) of two (H, W, C) images, as `cpu.l1_dssim` does."""
+    check_images(image, target)
+    offsets = torch.arange(-5, 6, dtype=image.dtype, device=image.device)
+    line = torch.exp(-(offsets**2) / (2 * 1.5**2))
+    line = line / line.sum()
+
+    def blur(picture: Tensor) -> Tensor:
+        channels = picture.permute(2, 0, 1)[:, None]
+        rows = torch.nn.functional.conv2d(channels, line[None, None, None, :], padding=(0, 5))
+        return torch.nn.functional.conv2d(rows, line[None, None, :, None], padding=(5, 0))
+
+    c1, c2 = 0.01**2, 0.03**2
+    x, y = blur(image), blur(target)
+    xx, yy, xy = blur(image * image) - x * x, blur(target * target) - y * y, blur(image * target) - x * y
+    ssim = (2 * x * y + c1) * (2 * xy + c2) / ((x * x + y * y + c1) * (xx + yy + c2))
+    return (1 - weight_dssim) * (image - target).abs().mean() + weight_dssim * (1 - ssim.mean())
+
+
+def adam_step(
+    param: Tensor,
+    grad: Tensor,
+    exp_avg: Tensor,
+    exp_avg_sq: Tensor,
+    lr: float,
+    beta1: float,
+    beta2: float,
+    eps: float,
+    step: int,
+) -> None:
+    """Take one step of Adam, in place, as `torch.optim.Adam` does. `step` counts from 1."""
+    with torch.no_grad():
+        exp_avg.mul_(beta1).add_(grad, alpha=1 - beta1)
+        exp_avg_sq.mul_(beta2).addcmul_(grad, grad, value=1 - beta2)
+        spread = exp_avg_sq.sqrt().div_(math.sqrt(1 - beta2**step)).add_(eps)
+        param.addcdiv_(exp_avg, spread, value=-lr / (1 - beta1**step))

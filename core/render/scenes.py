@@ -24,7 +24,7 @@ def random_scene(
     radius_px = np.minimum(median_radius_px * np.exp(0.9 * rng.standard_normal(count)), 0.2 * width)
     flatness = -np.abs(rng.normal(0, 0.7, (count, 3)))
     flatness[:, 0] = 0
-    arrays = SpacetimeTensors(
+    arrays = dict(
         means=np.stack((x, y, z), 1),
         motions=rng.normal(0, 0.05, (count, 3, 3)) * z[:, None, None] * 0.2,
         quats=rng.standard_normal((count, 4)),
@@ -35,5 +35,5 @@ def random_scene(
         trbf_centers=rng.uniform(0, 1, count),
         trbf_log_scales=rng.normal(1.0, 0.5, count),
     )
-    tensors = SpacetimeTensors(*(torch.tensor(array, dtype=torch.float32) for array in arrays))
+    tensors = SpacetimeTensors(**{name: torch.tensor(array, dtype=torch.float32) for name, array in arrays.items()})
     return tensors, Camera(width, height, focal, focal, width / 2, height / 2)

@@ -9,7 +9,9 @@
 #include <stdexcept>
 #include <vector>
 
+#include "adam.hpp"
 #include "frame.hpp"
+#include "loss.hpp"
 #include "thread_pool.hpp"
 
 namespace holoreel {
@@ -214,4 +216,23 @@ HOLOREEL_API int64_t holoreel_frame_visible(const void* frame) { return static_c
 
 HOLOREEL_API void holoreel_frame_timings(const void* frame, HoloreelTimings* out) {
     *out = static_cast<const Frame*>(frame)->timings;
+}
+
+// Returns 0, or -1 with an error text; writes the loss, and its gradient with respect to `image` where that is not null.
+HOLOREEL_API int holoreel_l1_dssim(const float* image, const float* target, int height, int width, int channels,
+                                   double weight, double* loss, float* gradient) {
+    const bool good = guarded([&] {
+        if (height < 1 || width < 1 || channels < 1 || static_cast<int64_t>(width) * channels > INT32_MAX / 2)
+            throw std::invalid_argument("the image is empty or too wide");
+        *loss = l1_dssim(image, target, height, width, channels, weight, gradient);
+    });
+    return good ? 0 : -1;
+}
+
+HOLOREEL_API int holoreel_adam_step(float* values, const float* gradient, float* mean, float* mean_square,
+                                    int64_t count, double rate, double beta1, double beta2, double epsilon,
+                                    int64_t step) {
+    const bool good = guarded(
+        [&] { adam_step(values, gradient, mean, mean_square, count, rate, beta1, beta2, epsilon, step); });
+    return good ? 0 : -1;
 }

@@ -4,7 +4,7 @@
 
 #include <cstdint>
 
-#define HOLOREEL_ABI 3
+#define HOLOREEL_ABI 4
 #define HOLOREEL_API extern "C" __attribute__((visibility("default")))
 
 struct HoloreelCamera {
