@@ -297,9 +297,8 @@ def _watch_density(splats: Splats, camera: Camera, rules: Rules, density: Densit
     splats.means.register_hook(add)
 
 
-def l1_dssim(image: Tensor, target: Tensor, weight_dssim: float) -> Tensor:
-    """Return (1 - w) mean|image - target| + w (1 - mean SSIM) of two (H, W, C) images, as `cpu.l1_dssim` does."""
-    check_images(image, target)
+def ssim_map(image: Tensor, target: Tensor) -> Tensor:
+    """Return the SSIM (C, 1, H, W) of two (H, W, C) images in [0, 1]: 11 x 11 Gaussian window of sigma 1.5, zero padding."""
     offsets = torch.arange(-5, 6, dtype=image.dtype, device=image.device)
     line = torch.exp(-(offsets**2) / (2 * 1.5**2))
     line = line / line.sum()
@@ -312,8 +311,14 @@ def l1_dssim(image: Tensor, target: Tensor, weight_dssim: float) -> Tensor:
     c1, c2 = 0.01**2, 0.03**2
     x, y = blur(image), blur(target)
     xx, yy, xy = blur(image * image) - x * x, blur(target * target) - y * y, blur(image * target) - x * y
-    ssim = (2 * x * y + c1) * (2 * xy + c2) / ((x * x + y * y + c1) * (xx + yy + c2))
-    return (1 - weight_dssim) * (image - target).abs().mean() + weight_dssim * (1 - ssim.mean())
+    return (2 * x * y + c1) * (2 * xy + c2) / ((x * x + y * y + c1) * (xx + yy + c2))
+
+
+def l1_dssim(image: Tensor, target: Tensor, weight_dssim: float) -> Tensor:
+    """Return (1 - w) mean|image - target| + w (1 - mean SSIM) of two (H, W, C) images, as `cpu.l1_dssim` does."""
+    check_images(image, target)
+    difference = (image - target).abs().mean()
+    return (1 - weight_dssim) * difference + weight_dssim * (1 - ssim_map(image, target).mean())
 
 
 def adam_step(
