@@ -15,7 +15,7 @@ from holoreel.sample_scenes import kit
 
 FRAMES = 48
 SEED = 11
-TARGET = (0.0, 0.0, 1.0)
+TARGET = (0.0, 0.0, 0.95)
 CAMERA = {"distance": 7.1, "down_deg": 9.0, "lens": 42.0}
 STAGE_RADIUS = 1.95
 ROUND_FRAMES = 96

@@ -32,12 +32,18 @@ def linear_rgb(color: str) -> tuple[float, float, float]:
 # --------------------------------------------------------------------------------------------------------------- paints
 
 
+def use_nodes(owner: bpy.types.Material | bpy.types.World) -> None:
+    """Give it a node tree: Blender 4.5 wants to be asked, 5.x has one from the start."""
+    if owner.node_tree is None:
+        owner.use_nodes = True
+
+
 def paint(
     name: str, color: str, *, roughness: float = 0.8, grain: float = 0.1, scale: float = 6.0
 ) -> bpy.types.Material:
     """A Principled material whose color wanders by ±`grain` (relative) over blotches about 1/`scale` m wide."""
     material = bpy.data.materials.new(name)
-    material.use_nodes = True
+    use_nodes(material)
     tree = material.node_tree
     shader = tree.nodes["Principled BSDF"]
     shader.inputs["Roughness"].default_value = roughness
@@ -88,7 +94,7 @@ def mural(name: str, srgb: np.ndarray, *, roughness: float = 0.9) -> bpy.types.M
     image.update()
     image.pack()
     material = bpy.data.materials.new(name)
-    material.use_nodes = True
+    use_nodes(material)
     tree = material.node_tree
     shader = tree.nodes["Principled BSDF"]
     shader.inputs["Roughness"].default_value = roughness
@@ -367,6 +373,7 @@ def start(frames: int = 48) -> bpy.types.Scene:
     render = scene.render
     render.engine = "CYCLES"
     render.resolution_x, render.resolution_y, render.fps = 1280, 720, 24
+    render.filepath = "//"
     scene.view_settings.view_transform = "Standard"
     scene.view_settings.look = "None"
     cycles = scene.cycles
@@ -384,7 +391,7 @@ def sky(scene: bpy.types.Scene, low: str, high: str, strength: float) -> None:
     """Soft light from all around: one color at the horizon, another overhead."""
     world = bpy.data.worlds.new("Soft sky")
     scene.world = world
-    world.use_nodes = True
+    use_nodes(world)
     world.light_settings.distance = 2.0
     world.cycles.sampling_method = "NONE"  # so soft that aiming at its bright parts costs more than it saves
     tree = world.node_tree
@@ -425,6 +432,6 @@ def camera(scene: bpy.types.Scene, target: Point, distance: float, down_deg: flo
 
 def save(path: Path) -> None:
     """Write the open scene, compressed and without anything that lies outside the file."""
-    bpy.ops.outliner.orphans_purge(do_recursive=True)
+    bpy.data.orphans_purge(do_recursive=True)
     bpy.context.preferences.filepaths.save_version = 0
     bpy.ops.wm.save_as_mainfile(filepath=str(path), compress=True, relative_remap=True)
