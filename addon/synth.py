@@ -132,8 +132,6 @@ def apply_look(scene: bpy.types.Scene, job: dict[str, Any]) -> None:
     for name in ("use_motion_blur", "use_compositing", "use_sequencer", "use_stamp", "use_border", "use_multiview"):
         setattr(render, name, False)
     render.use_crop_to_border = False
-    render.use_file_extension = True
-    render.use_overwrite = True
     scene.display_settings.display_device = "sRGB"
     view = scene.view_settings
     view.view_transform, view.look, view.exposure, view.gamma = "Standard", "None", 0.0, 1.0

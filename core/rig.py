@@ -76,9 +76,7 @@ def fit_to_scene(request: RigRequest, scene: SceneFacts) -> RigSettings:
     """
     middle, extent = _middle_and_extent(scene)
     camera = scene.camera
-    target = request.target or scene.target
-    if target is None:
-        target = _nearest_on_axis(camera, middle) if camera else middle
+    target = request.target or scene.target or (_nearest_on_axis(camera, middle) if camera else middle)
     fov = request.fov_degrees
     if fov is None:
         fov = math.degrees(2 * math.atan(camera.width / 2 / camera.fx)) if camera else _DEFAULT_FOV_DEGREES
@@ -94,7 +92,7 @@ def fit_to_scene(request: RigRequest, scene: SceneFacts) -> RigSettings:
         cameras=request.cameras,
         width=request.width,
         height=request.height,
-        target=(float(target[0]), float(target[1]), float(target[2])),
+        target=target,
         radius=radius if request.radius is None else request.radius,
         azimuth_degrees=azimuth if request.azimuth_degrees is None else request.azimuth_degrees,
         elevation_degrees=elevation if request.elevation_degrees is None else request.elevation_degrees,
@@ -135,14 +133,15 @@ def arc(settings: RigSettings) -> list[Camera]:
         lift = (0, 1, -1)[(place - middle) % 3]
         azimuth = settings.azimuth_degrees + settings.span_degrees * float(steps[place])
         elevation = settings.elevation_degrees + settings.rise_degrees * lift
-        cameras.append(_aimed(settings, azimuth, elevation, _name(index, count)))
+        cameras.append(_aimed(settings, azimuth, elevation, camera_name(index, count)))
     return cameras
 
 
 PRESETS: dict[str, Callable[[RigSettings], list[Camera]]] = {"arc": arc}
 
 
-def _name(index: int, count: int) -> str:
+def camera_name(index: int, count: int) -> str:
+    """The name of camera `index` of `count`: cam00, cam01, …"""
     return f"cam{index:0{max(2, len(str(count - 1)))}d}"
 
 
@@ -167,12 +166,16 @@ def _middle_and_extent(scene: SceneFacts) -> tuple[Vector, float]:
         return (0.0, 0.0, 0.0), 1.0
     low, high = np.asarray(scene.bounds[0]), np.asarray(scene.bounds[1])
     middle = (low + high) / 2
-    return (float(middle[0]), float(middle[1]), float(middle[2])), max(float(np.linalg.norm(high - low)) / 2, 1e-3)
+    return _vector(middle), max(float(np.linalg.norm(high - low)) / 2, 1e-3)
 
 
-def _nearest_on_axis(camera: Camera, point: Vector) -> NDArray[np.float64]:
+def _nearest_on_axis(camera: Camera, point: Vector) -> Vector:
     """The point of the camera's optical axis nearest to `point`, in front of the camera."""
     forward = camera.world_to_camera[2, :3]
     depth = float(forward @ (np.asarray(point) - camera.center))
     distance = float(np.linalg.norm(np.asarray(point) - camera.center))
-    return camera.center + forward * (depth if depth > 1e-3 * max(distance, 1e-6) else max(distance, 1.0))
+    return _vector(camera.center + forward * (depth if depth > 1e-3 * max(distance, 1e-6) else max(distance, 1.0)))
+
+
+def _vector(values: NDArray[np.float64]) -> Vector:
+    return float(values[0]), float(values[1]), float(values[2])

@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import HoloreelError
+from ..files import atomic_path
 
 BACKGROUND_DEPTH = 1e9  # Cycles writes 1e10 where nothing was hit
 
@@ -57,6 +58,16 @@ def read_depth(path: Path, width: int, height: int) -> NDArray[np.float32]:
     _check_size(path, depth.shape, width, height)
     depth[~(depth < BACKGROUND_DEPTH)] = np.inf
     return depth
+
+
+def write_depth(path: Path, depth: NDArray[np.float32]) -> None:
+    """Write a depth map (H, W) as float32 EXR of one channel Z, atomically; infinity becomes 1e10, as in Cycles."""
+    import OpenEXR
+
+    pixels = np.where(np.isfinite(depth), depth, 1e10).astype(np.float32)
+    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+    with atomic_path(path) as temporary:
+        OpenEXR.File(header, {"Z": pixels}).write(str(temporary))
 
 
 def _check_size(path: Path, shape: tuple[int, ...], width: int, height: int) -> None:

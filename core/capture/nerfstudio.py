@@ -174,11 +174,11 @@ def _entry(path: Path, meta: dict[str, Any], index: int, frame: Any, world: NDAr
     for key in _DISTORTION:
         if frame.get(key, meta.get(key, 0)) != 0:
             raise HoloreelError(f"{where}: {key} is not 0; undistort the pictures, lens distortion is not supported.")
-    lens = {field: frame.get(key, meta.get(key)) for field, key in _LENS.items()}
+    lens: dict[str, Any] = {field: frame.get(key, meta.get(key)) for field, key in _LENS.items()}
     if missing := [_LENS[field] for field, value in lens.items() if value is None]:
         raise HoloreelError(f"{where}: {missing[0]} is missing, there and at the top; export the capture again.")
     try:
-        pose = world @ rigid(frame.get("transform_matrix")) @ _OPENGL
+        pose = world @ rigid(frame.get("transform_matrix", [])) @ _OPENGL
     except ValueError as error:
         raise HoloreelError(f"{where}.transform_matrix {error}; export the capture again.") from error
     try:
