@@ -434,4 +434,7 @@ def save(path: Path) -> None:
     """Write the open scene, compressed and without anything that lies outside the file."""
     bpy.data.orphans_purge(do_recursive=True)
     bpy.context.preferences.filepaths.save_version = 0
+    for space in (space for screen in bpy.data.screens for area in screen.areas for space in area.spaces):
+        if space.type == "FILE_BROWSER" and space.params:
+            space.params.directory = b"//"  # Blender writes the user's home folder here
     bpy.ops.wm.save_as_mainfile(filepath=str(path), compress=True, relative_remap=True)
