@@ -49,12 +49,12 @@ def set_input(modifier: bpy.types.NodesModifier, name: str, value: Any) -> None:
     identifier = input_identifier(modifier.node_group, name)
     if has_input_properties(modifier):
         getattr(modifier.properties.inputs, identifier).value = value
-        return
-    current = modifier[identifier]
-    if isinstance(value, str) and isinstance(current, int):
-        value = _menu_values(modifier, identifier)[value]
-    modifier[identifier] = type(current)(value) if isinstance(current, (bool, int, float)) else value
-    modifier.id_data.update_tag()  # an ID property changes without telling the dependency graph
+    else:
+        current = modifier[identifier]
+        if isinstance(value, str) and isinstance(current, int):
+            value = _menu_values(modifier, identifier)[value]
+        modifier[identifier] = type(current)(value) if isinstance(current, (bool, int, float)) else value
+    modifier.id_data.update_tag()  # neither kind tells the dependency graph that it changed
 
 
 def input_path(modifier: bpy.types.NodesModifier, name: str) -> str:

@@ -20,6 +20,7 @@ INFO = "holoreel"  # custom property of a reel's object: source, kind, fps, fram
 
 FRAME_BY_FRAME, REAL_TIME = "FRAMES", "REAL_TIME"
 
+FROM_FILE = "FILE"
 # Quarter turns that bring the axis that points up in the file onto Blender's Z.
 UPRIGHT = {
     "Z": Matrix.Identity(4),
@@ -60,9 +61,9 @@ def add_reel(
 
     `start` is the scene frame of the reel's first frame: None takes the reel's own `frame_start`, and the scene's first
     frame for files without one. `pace` FRAMES shows one reel frame per scene frame, REAL_TIME keeps the reel's speed
-    whatever the scene's rate. `up` is the file's axis that shall point up (a key of `UPRIGHT`): None takes what the
-    file says. `set_scene_timing` sets the scene's frame range and rate to the reel's; otherwise the scene stays as it
-    is.
+    whatever the scene's rate. `up` is the file's axis that shall point up (a key of `UPRIGHT`), or `FROM_FILE` for the
+    one that the file says; None turns nothing. `set_scene_timing` sets the scene's frame range and rate to the reel's;
+    otherwise the scene stays as it is.
     """
     scene = context.scene
     if start is None:
@@ -72,7 +73,8 @@ def add_reel(
     rate = scene.render.fps / scene.render.fps_base
     timeline = Timeline(loaded.frame_count, start=start, speed=loaded.fps / rate if pace == REAL_TIME else 1.0)
     created = create_reel_object(context, loaded.path.stem, loaded.gaussians, timeline)
-    created.matrix_world = UPRIGHT[up or loaded.up or "Z"]
+    if up is not None:
+        created.matrix_world = UPRIGHT[(loaded.up or "Z") if up == FROM_FILE else up]
     created[INFO] = {
         "source": str(loaded.path),
         "kind": loaded.kind,

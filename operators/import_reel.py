@@ -10,7 +10,7 @@ from ..addon import reels
 from ..core.errors import HoloreelError
 from ..core.reel import load_gaussians
 
-FROM_FILE = "FILE"
+UNTURNED = "UNTURNED"
 
 
 class HOLOREEL_OT_import_reel(bpy.types.Operator, ImportHelper):
@@ -41,9 +41,12 @@ class HOLOREEL_OT_import_reel(bpy.types.Operator, ImportHelper):
     up: bpy.props.EnumProperty(
         name="Up",
         description="The file's axis that shall point up",
-        items=[(FROM_FILE, "From File", "As the file says; unturned where it does not say")]
-        + [(axis, axis, f"{axis} of the file points up") for axis in reels.UPRIGHT],
-        default=FROM_FILE,
+        items=[
+            (UNTURNED, "Unturned", "Turn nothing, so that the reel stays where its cameras saw it"),
+            (reels.FROM_FILE, "From File", "Turn as the file says, if it says so"),
+            *((axis, axis, f"{axis} of the file points up") for axis in reels.UPRIGHT),
+        ],
+        default=UNTURNED,
     )
     set_scene_timing: bpy.props.BoolProperty(
         name="Set Scene Frame Range",
@@ -67,7 +70,7 @@ class HOLOREEL_OT_import_reel(bpy.types.Operator, ImportHelper):
         for chosen in context.selected_objects:
             chosen.select_set(False)
         for one in loaded:
-            up = None if self.up == FROM_FILE else self.up
+            up = None if self.up == UNTURNED else self.up
             created = reels.add_reel(context, one, pace=self.pace, up=up, set_scene_timing=self.set_scene_timing)
             created.select_set(True)
             context.view_layer.objects.active = created

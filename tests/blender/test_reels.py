@@ -123,6 +123,20 @@ def test_keyed_offset_chooses_frames(random_model: Model) -> None:
     assert_same(evaluated(reel), model.evaluate(0.0))
 
 
+def test_changed_inputs_show_at_once(random_model: Model) -> None:
+    model = random_model(200)
+    reel = reels.create_reel_object(bpy.context, "reel", model, Timeline(10, speed=0.0))
+    modifier = show_points(reel)
+    for offset in (0.0, 5.0, 2.5):
+        compat.set_input(modifier, "Offset", offset)
+        assert_same(evaluated(reel), model.evaluate(offset / 10))
+    for look, points in (("Splats", False), (POINTS, True)):
+        compat.set_input(modifier, "Look", look)
+        assert bool(len(evaluated(reel)["position"])) == points
+    reels.set_timeline(reel, Timeline(10, speed=0.0, offset=3.0, repeat=LOOP))
+    assert_same(evaluated(reel), model.evaluate(0.3))
+
+
 def test_nothing_visible_is_no_error() -> None:
     model = SpacetimeGaussians(
         *(np.zeros(shape) for shape in ((3, 3), (3, 3, 3), (3, 4), (3, 4), (3, 3))),
@@ -193,7 +207,7 @@ def test_import_of_a_reel(count: int, random_model: Model, tmp_path: Path) -> No
     save_gaussians(path, model, fps=25.0, frame_start=101, frame_count=count, up="-Y")
     scene = bpy.context.scene
     before = (scene.frame_start, scene.frame_end, scene.render.fps)
-    reel = reels.import_reel(bpy.context, path)
+    reel = reels.import_reel(bpy.context, path, up=reels.FROM_FILE)
     assert (scene.frame_start, scene.frame_end, scene.render.fps) == before
     assert reel.name == "walk"
     assert reel[reels.INFO]["source"] == str(path)
