@@ -24,6 +24,12 @@ def read_image(path: str | Path) -> Image:
     path = Path(path)
     if path.suffix.lower() == ".exr":
         return read_exr(path)[0]
+    pixels = read_pixels(path)
+    return pixels.astype(np.float32) / np.float32(np.iinfo(pixels.dtype).max)
+
+
+def read_pixels(path: str | Path) -> NDArray[np.uint8] | NDArray[np.uint16]:
+    """Read an 8 or 16-bit picture as the integers it holds, (H, W, 3 or 4); otherwise as `read_image`."""
     import imageio.v3 as iio
 
     try:
@@ -35,7 +41,7 @@ def read_image(path: str | Path) -> Image:
     pixels = np.atleast_3d(pixels)
     if pixels.shape[2] <= 2:  # gray, or gray and alpha
         pixels = np.concatenate([pixels[:, :, :1]] * 3 + [pixels[:, :, 1:]], axis=2)
-    return pixels.astype(np.float32) / np.float32(np.iinfo(pixels.dtype).max)
+    return pixels
 
 
 def write_png(path: str | Path, image: NDArray[np.floating]) -> None:

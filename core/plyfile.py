@@ -92,7 +92,7 @@ def _read_header(path: Path, file: BinaryIO) -> PlyHeader:
     header = _parse_header(path, lines, file.tell())
     left = path.stat().st_size - header.size
     # An ASCII number takes a character and a separator at least; the last separator may be missing.
-    least = header.count * (header.dtype.itemsize if header.format != "ascii" else 2 * len(header.dtype))
+    least = header.count * (header.dtype.itemsize if header.format != "ascii" else 2 * len(header.dtype.names or ()))
     if left < least - (header.format == "ascii"):
         raise HoloreelError(
             f"{path} is cut short: 'element vertex' promises {header.count} vertices ({least} bytes), "
@@ -160,7 +160,8 @@ def _read_ascii(path: Path, file: BinaryIO, header: PlyHeader) -> NDArray[np.voi
     if header.count == 0:
         return np.empty(0, header.dtype)
     try:
-        table = np.loadtxt(file, header.dtype, max_rows=header.count, ndmin=1)
+        rows = (line.decode("ascii", "replace") for line in file if line.strip())
+        table = np.loadtxt(rows, header.dtype, comments=None, max_rows=header.count, ndmin=1)
     except (ValueError, OverflowError) as error:
         raise HoloreelError(f"{path}: a vertex is not what the header says ({error}); export it again.") from error
     if len(table) != header.count:

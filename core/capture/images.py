@@ -8,24 +8,17 @@ from numpy.typing import NDArray
 
 from ..errors import HoloreelError
 from ..files import atomic_path
+from ..images import read_pixels
 
 BACKGROUND_DEPTH = 1e9  # Cycles writes 1e10 where nothing was hit
 
 
 def read_picture(path: Path, width: int, height: int) -> NDArray[np.uint8]:
     """Read a picture as (height, width, 3), or (height, width, 4) with straight alpha where it has alpha."""
-    import imageio.v3 as imageio
-
-    try:
-        picture = np.asarray(imageio.imread(path))
-    except (OSError, ValueError, SyntaxError) as error:  # Pillow says SyntaxError for a broken PNG
-        raise HoloreelError(f"{path} cannot be read as a picture ({error}): render or fetch it again.") from error
-    if picture.dtype == np.uint16:
-        picture = ((picture.astype(np.uint32) * 255 + 32767) // 65535).astype(np.uint8)
-    if picture.ndim == 2:
-        picture = np.repeat(picture[..., None], 3, axis=2)
-    if picture.dtype != np.uint8 or picture.ndim != 3 or picture.shape[2] not in (3, 4):
-        raise HoloreelError(f"{path} is no 8- or 16-bit RGB(A) picture: convert it to PNG.")
+    pixels = read_pixels(path)
+    if pixels.dtype == np.uint16:
+        pixels = (pixels.astype(np.uint32) * 255 + 32767) // 65535
+    picture = pixels.astype(np.uint8, copy=False)
     _check_size(path, picture.shape, width, height)
     return picture
 

@@ -236,7 +236,8 @@ def _cameras(path: Path, entries: list[_Entry], extra: dict[str, Any] | None) ->
             )
     order = list(first)
     if extra and isinstance(extra.get("cameras"), list):
-        order.sort(key=lambda name: (extra["cameras"] + [name]).index(name))
+        rank = {name: index for index, name in enumerate(extra["cameras"]) if isinstance(name, str)}
+        order.sort(key=lambda name: rank.get(name, len(rank)))
     return {name: replace(entries[first[name]].camera, name=name) for name in order}, names
 
 

@@ -72,10 +72,10 @@ def run(
     request = RigRequest(cameras, width, height, target, radius, azimuth, elevation, fov, span, rise)
     job = SynthJob(scene, request, parse_frames(frames), rig, samples, holdout, film, depth, seed_points, denoise, seed)
     begin = time.monotonic()
-    with tqdm(unit="view", dynamic_ncols=True) as bar:
+    with tqdm(unit="view", dynamic_ncols=True, smoothing=0.1) as bar:
 
         def show(done: int, total: int) -> None:
-            if bar.total is None:
+            if bar.total is None:  # what an earlier call did is no speed of this one
                 bar.total, bar.initial = total, done
             bar.update(done - bar.n)
 

@@ -61,9 +61,15 @@ def made(blender: Blender, job: SynthJob, tmp_path_factory: pytest.TempPathFacto
     return out
 
 
-@pytest.fixture(scope="module")
-def capture(made: Path) -> Capture:
-    return read_capture(made)
+@pytest.fixture(scope="module", params=[".venv-bpy45", ".venv-bpy52"])
+def capture(request: pytest.FixtureRequest, job: SynthJob, tmp_path_factory: pytest.TempPathFactory) -> Capture:
+    """The same job by each supported Blender."""
+    environment = Path(__file__).parents[2] / request.param
+    if not environment.is_dir():
+        pytest.skip(f"no {request.param}")
+    out = tmp_path_factory.mktemp("capture")
+    synthesize(job, out, lambda: find_blender(environment))
+    return read_capture(out)
 
 
 def test_capture_is_whole(capture: Capture) -> None:
@@ -215,6 +221,13 @@ def test_killed_in_the_middle_and_resumed(
         if path.suffix == ".png":
             assert np.array_equal(imageio.imread(path), imageio.imread(out / path.relative_to(made)))
     assert json.loads((made / "transforms.json").read_text()) == json.loads((out / "transforms.json").read_text())
+
+
+def test_cameras_that_see_nothing_are_named(job: SynthJob, blender: Blender, tmp_path: Path) -> None:
+    rig = RigRequest(2, 16, 16, target=(0, 0, 30), radius=1, fov_degrees=20, elevation_degrees=0)
+    blind = replace(job, rig=rig, frames=(3, 3), samples=1, seed_points=0, depth=False)
+    result = synthesize(blind, tmp_path, lambda: blender)
+    assert result.warnings == ["cam00 sees a single color at frame 3", "cam01 sees a single color at frame 3"]
 
 
 def test_two_at_once_are_refused(job: SynthJob, blender: Blender, tmp_path: Path) -> None:
