@@ -58,7 +58,7 @@ class HOLOREEL_PT_timeline(_SubPanel, bpy.types.Panel):
 
     def draw(self, context: bpy.types.Context) -> None:
         """Draw the mapping."""
-        self.inputs(context, "Start Frame", "Speed", "Offset", "First Frame", "Last Frame", "Repeat")
+        self.inputs(context, "Start Frame", "Speed", "Offset", "First Frame", "Last Frame", "Frame Count", "Repeat")
 
 
 class HOLOREEL_PT_look(_SubPanel, bpy.types.Panel):

@@ -238,10 +238,15 @@ class Tree:
         high: float | None = None,
         panel: str | None = None,
         kind: str = "Float",
+        is_field: bool = False,
     ) -> Float:
-        """Declare a number (`kind` "Float" or "Integer") with its tooltip and range."""
+        """Declare a number (`kind` "Float" or "Integer") with its tooltip and range.
+
+        It is one number for all points, unless `is_field`; then it may differ from point to point.
+        """
         item = self._socket("INPUT", kind, name, tooltip, panel)
         item.default_value = default
+        item.force_non_field = not is_field
         if low is not None:
             item.min_value = low
         if high is not None:

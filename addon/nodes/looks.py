@@ -48,7 +48,7 @@ def splats_inputs(tree: Tree) -> dict[str, Float]:
 @node_group("Holoreel sRGB to Linear", 1, "Convert one display-referred value to scene-linear")
 def linear_from_srgb(tree: Tree) -> None:
     """IEC 61966-2-1, the linear branch going on below zero."""
-    value = tree.float_input("Value", "sRGB value, 0 to 1")
+    value = tree.float_input("Value", "sRGB value, 0 to 1", is_field=True)
     curve = ((value + 0.055) * (1.0 / 1.055)).at_least(0.0).power(2.4)
     bright = value.above(0.04045)
     tree.output("Value", value * (1.0 / 12.92) * (1.0 - bright) + curve * bright)
