@@ -298,7 +298,7 @@ def _watch_density(splats: Splats, camera: Camera, rules: Rules, density: Densit
 
 
 def ssim_map(image: Tensor, target: Tensor) -> Tensor:
-    """Return the SSIM (C, 1, H, W) of two (H, W, C) images in [0, 1]: 11 x 11 Gaussian window of sigma 1.5, zero padding."""
+    """Return the SSIM (C, 1, H, W) of two (H, W, C) images: 11 x 11 Gaussian window of sigma 1.5, zero padding."""
     offsets = torch.arange(-5, 6, dtype=image.dtype, device=image.device)
     line = torch.exp(-(offsets**2) / (2 * 1.5**2))
     line = line / line.sum()
