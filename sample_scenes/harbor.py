@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Build harbor.blend: a paper-craft harbor on a round tray, on a clear morning.
 
-Run with Blender's Python, `python sample_scenes/harbor.py`. Everything loops over frames 1-48.
+Run with Blender's Python, `python sample_scenes/harbor.py`. Plays over frames 1-48; all but tug and gulls loop.
 """
 
 from __future__ import annotations
