@@ -17,8 +17,9 @@ def read_picture(path: Path, width: int, height: int) -> NDArray[np.uint8]:
     """Read a picture as (height, width, 3), or (height, width, 4) with straight alpha where it has alpha."""
     pixels = read_pixels(path)
     if pixels.dtype == np.uint16:
-        pixels = (pixels.astype(np.uint32) * 255 + 32767) // 65535
-    picture = pixels.astype(np.uint8, copy=False)
+        picture = ((pixels.astype(np.uint32) * 255 + 32767) // 65535).astype(np.uint8)
+    else:
+        picture = pixels.astype(np.uint8, copy=False)
     _check_size(path, picture.shape, width, height)
     return picture
 
