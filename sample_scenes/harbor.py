@@ -21,6 +21,7 @@ CAMERA = {"distance": 7.0, "down_deg": 10.5, "lens": 42.0}
 TRAY_RADIUS = 2.15
 SEA_LEVEL = 0.2
 SLICES = 12
+TABLE_RINGS = ((0.535, 0.02), (0.645, 0.01))  # radius and width, as shares of the half table
 WAVE_LENGTH = 0.78
 SAIL_PATH = {"center": (0.08, -0.62), "radii": (0.68, 0.36), "phase": math.radians(-58)}
 TUG_PATH = {"radius": 1.62, "first_deg": 212.0, "sweep_deg": 46.0}
@@ -64,7 +65,7 @@ SPOUT = (  # x, z, radius of a drop
     (0.0, 0.08, 0.05), (0.0, 0.17, 0.052), (0.0, 0.26, 0.055), (-0.1, 0.31, 0.05), (0.1, 0.31, 0.05),
     (-0.19, 0.27, 0.045), (0.19, 0.27, 0.045), (-0.24, 0.18, 0.04), (0.24, 0.18, 0.04),
 )
-GULLS = ((3.4, 0.5, 0.0), (4.9, 0.6, 0.12), (6.0, 0.52, -0.14))  # angle, radius, z about the flock
+GULLS = ((3.4, 0.5, 0.0), (4.7, 0.62, 0.1), (1.2, 0.55, 0.14))  # angle, radius, z about the flock
 # fmt: on
 
 
@@ -90,9 +91,9 @@ def paint_table(size: int = 768) -> np.ndarray:
     noise = kit.soft_noise(np.random.default_rng(SEED + 1), x * 5, y * 5)
     table = kit.blend([(0.0, "#d3ab8c"), (1.0, "#e2c3a0")], radius + 0.1 * noise)
     rays = np.clip(6 * np.sin(16 * angle), -1, 1) * (radius > 0.5)
-    ring = ((radius > 0.525) & (radius < 0.545)) | ((radius > 0.64) & (radius < 0.65))
-    shade = 1 + 0.045 * rays * (radius < 0.64) - 0.03 * rays * (radius >= 0.65) + 0.02 * noise
-    return np.where(ring[..., None], kit.blend([(0.0, "#f6e8cd")], radius), table * shade[..., None])
+    shade = 1 + np.where(radius < 0.645, 0.045, -0.03) * rays + 0.02 * noise
+    ring = sum(np.clip((width / 2 - np.abs(radius - at)) * size / 2 + 0.5, 0, 1) for at, width in TABLE_RINGS)
+    return table * shade[..., None] + ring[..., None] * (kit.blend([(0.0, "#f6e8cd")], radius) - table)
 
 
 def build_backdrop(paints: kit.Paints) -> None:
@@ -386,13 +387,13 @@ def build_gulls(paints: kit.Paints) -> None:
         gull = kit.empty(f"Gull {number}", (radius * math.cos(angle), radius * math.sin(angle), z), flock)
         gull.rotation_euler[2] = angle + math.pi / 2
         span = np.linspace(-1, 1, 13)
-        chord = 0.075 * (1 - 0.75 * np.abs(span))
+        chord = 0.095 * (1 - 0.75 * np.abs(span))
         rows = np.array([np.c_[side * chord - 0.06 * span**2, 0.24 * span, 0.05 * np.abs(span)] for side in (-1, 1)])
         wings = kit.strip(f"Wings {number}", rows, [paints["foam"]], parent=gull)
         beat = np.zeros((2, rows[..., 0].size, 3))
         beat[0, :, 2] = 0.14 * np.tile(span**2, 2)
         kit.wave_keys(wings, beat[0], beat[1], 12, phase=number * 1.9)
-        body = kit.ball(f"Gull body {number}", 0.045, paints["foam"], stretch=2.6, parent=gull)
+        body = kit.ball(f"Gull body {number}", 0.04, paints["foam"], stretch=3.0, parent=gull)
         body.rotation_euler[1] = math.pi / 2
 
 
