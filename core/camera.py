@@ -15,11 +15,12 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from .errors import HoloreelError
-from .files import read_json, write_json
+from .files import finite, read_json, write_json
 
 Array = NDArray[np.float64]
 
 MAX_SIZE = 1 << 16  # pixels along one side
+MAX_COORDINATE = 1e15  # of a camera's place
 RIGID_TOLERANCE = 1e-3  # largest entry of RᵀR − 1 that still counts as rounding
 
 
@@ -63,8 +64,12 @@ class Camera:
 
     def __post_init__(self) -> None:
         set_field = object.__setattr__  # the dataclass is frozen for everybody else
-        if self.model not in MODELS:
-            raise self._error("model", f"{self.model!r} is not supported; undistort it to one of {', '.join(MODELS)}")
+        if not isinstance(self.name, str):
+            raise HoloreelError(f"camera: name must be text, not {_short(self.name)}.")
+        if not isinstance(self.model, str) or self.model not in MODELS:
+            raise self._error(
+                "model", f"{_short(self.model)} is not supported; undistort it to one of {', '.join(MODELS)}"
+            )
         for key in ("width", "height"):
             set_field(self, key, self._size(key))
         for key in ("fx", "fy", "cx", "cy"):
@@ -75,12 +80,12 @@ class Camera:
         return HoloreelError(f"camera {self.name!r}: {key} {text}." if self.name else f"camera: {key} {text}.")
 
     def _number(self, key: str) -> float:
-        value = getattr(self, key)
-        if isinstance(value, bool) or not isinstance(value, (int, float, np.number)) or not math.isfinite(value):
-            raise self._error(key, f"must be a finite number, not {value!r}")
+        value = finite(getattr(self, key))
+        if value is None:
+            raise self._error(key, f"must be a finite number, not {_short(getattr(self, key))}")
         if key in ("fx", "fy") and value <= 0:
             raise self._error(key, f"must be positive, not {value!r}")
-        return float(value)
+        return value
 
     def _size(self, key: str) -> int:
         value = self._number(key)
@@ -196,7 +201,7 @@ class Camera:
         """Make a camera from `to_json`'s dictionary; errors begin with `source`."""
         needed = {"model", "width", "height", "fx", "fy", "cx", "cy", "world_to_camera"}
         model = value.get("model")
-        if model is not None and model not in MODELS:
+        if isinstance(model, str) and model not in MODELS:
             raise HoloreelError(f"{source}: model {model!r} is not supported; undistort it to {', '.join(MODELS)}.")
         if missing := sorted(needed - set(value)):
             raise HoloreelError(f"{source}: {missing[0]} is missing; a camera has {', '.join(sorted(needed))}.")
@@ -206,6 +211,12 @@ class Camera:
             return cls(**value)
         except HoloreelError as error:
             raise HoloreelError(f"{source}: {error}") from error
+
+
+def _short(value: object) -> str:
+    """A value for a sentence."""
+    text = repr(value)
+    return text if len(text) <= 40 else f"{text[:37]}..."
 
 
 def focal_from_fov(fov_degrees: float, pixels: int) -> float:
@@ -219,12 +230,12 @@ def rigid(matrix: ArrayLike) -> Array:
     """Return `matrix` as a 4 × 4 rotation and translation, rounding removed; a ValueError says what it is instead."""
     try:
         result = np.array(matrix, dtype=np.float64)
-    except (TypeError, ValueError) as error:
+    except (TypeError, ValueError, OverflowError) as error:
         raise ValueError("must be 4 rows of 4 numbers") from error
     if result.shape != (4, 4):
         raise ValueError(f"must be 4 rows of 4 numbers, not of shape {result.shape}")
-    if not np.isfinite(result).all():
-        raise ValueError("holds NaN or infinity")
+    if not (np.abs(result) < MAX_COORDINATE).all():
+        raise ValueError(f"holds NaN, infinity or a number beyond {MAX_COORDINATE:g}")
     rotation = result[:3, :3]
     offset = float(np.abs(rotation.T @ rotation - np.eye(3)).max())
     if offset > RIGID_TOLERANCE or np.linalg.det(rotation) < 0 or np.abs(result[3] - (0, 0, 0, 1)).max() > 1e-6:

@@ -2,12 +2,15 @@
 """Files that are either whole or absent: what is written appears under its name only once it is complete."""
 
 import json
+import math
 import os
 import secrets
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from .errors import HoloreelError
 
@@ -40,6 +43,17 @@ def write_json(path: str | Path, value: Any) -> None:
     text = json.dumps(value, indent=1, allow_nan=False)
     with atomic_path(path) as temporary:
         temporary.write_text(text + "\n", encoding="utf-8")
+
+
+def finite(value: Any) -> float | None:
+    """Return `value` as a float if it is a finite number, else None: what JSON holds may be huge, or no number."""
+    if isinstance(value, bool) or not isinstance(value, (int, float, np.number)):
+        return None
+    try:
+        number = float(value)
+    except OverflowError:
+        return None
+    return number if math.isfinite(number) else None
 
 
 def read_json(path: str | Path) -> dict[str, Any]:

@@ -2,6 +2,7 @@
 """A multi-view recording in memory: who looked, when, and where the pictures lie. Pictures are read one at a time."""
 
 import math
+import os
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -105,7 +106,7 @@ class Capture:
     def check_files(self) -> None:
         """Raise `HoloreelError` naming the first file that is missing, and how many more are."""
         paths = dict.fromkeys((*self.images.values(), *self.depths.values(), *self.seeds.values()))
-        missing = [path for path in paths if not path.is_file()]
+        missing = [path for path in paths if not os.path.isfile(path)]  # any name that cannot be is no file
         if missing:
             more = f" and {len(missing) - 1} more files" if len(missing) > 1 else ""
             raise HoloreelError(f"{self.source}: {missing[0]}{more} missing; fetch or render the capture again.")

@@ -7,7 +7,6 @@ objects named `holoreel`: at the top (version, fps, frame_start, frame_count, ca
 frame). Files without them are read too: entries of one pose and lens are one camera, evenly spaced times are frames.
 """
 
-import math
 import os
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -18,7 +17,7 @@ from numpy.typing import NDArray
 
 from ..camera import Camera, invert_rigid, rigid
 from ..errors import HoloreelError
-from ..files import read_json, write_json
+from ..files import finite, read_json, write_json
 from .capture import MAX_FRAMES, Capture, View
 
 FILE_NAME = "transforms.json"
@@ -204,18 +203,19 @@ def _existing(path: Path, name: str) -> Path:
     """The file `name` means; NeRF's files leave `.png` out."""
     file = path.parent / name.replace("\\", "/")
     png = file.with_name(file.name + ".png")
-    return png if not file.suffix and png.is_file() else file
+    return png if not file.suffix and os.path.isfile(png) else file
 
 
 def _number(path: Path, field: str, value: Any) -> float:
-    if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value):
-        raise HoloreelError(f"{path}: {field} must be a finite number, not {value!r}.")
-    return float(value)
+    number = finite(value)
+    if number is None:
+        raise HoloreelError(f"{path}: {field} must be a finite number, not {str(value)[:40]}.")
+    return number
 
 
 def _integer(path: Path, field: str, value: Any) -> int:
     if isinstance(value, bool) or not isinstance(value, int) or abs(value) > 2**31:
-        raise HoloreelError(f"{path}: {field} must be a whole number, not {value!r}.")
+        raise HoloreelError(f"{path}: {field} must be a whole number, not {str(value)[:40]}.")
     return value
 
 

@@ -143,6 +143,15 @@ def test_impossible_fields_are_named(key: str, value: object) -> None:
         Camera(**(good | {key: value}))
 
 
+def test_no_value_of_a_file_causes_a_traceback() -> None:
+    good = Camera(8, 8, 5, 5, 4, 4).to_json() | {"name": "a"}
+    for key in good:
+        for strange in (None, [], {}, [1], 10**400, -(10**400), "x", [[10**400] * 4] * 4, True):
+            if (key, strange) != ("name", "x"):
+                with pytest.raises(HoloreelError, match=key):
+                    Camera.from_json(good | {key: strange}, "CAMERA.json")
+
+
 def test_camera_file(tmp_path: Path) -> None:
     path = tmp_path / "CAMERA.json"
     camera = Camera.look_at((1, 2, 3), (0, 0, 0), width=32, height=18, fx=30, name="middle")

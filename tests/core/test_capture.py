@@ -274,6 +274,41 @@ def test_lying_files_are_refused(
     assert "\n" not in str(error.value)
 
 
+def places(value: Any, path: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
+    """The paths of everything inside a JSON value."""
+    inner = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
+    return [*([path] if path else []), *(place for key, item in inner for place in places(item, (*path, key)))]
+
+
+STRANGE = [
+    None, True, -1, 0, 10**400, 1e308, math.nan, math.inf, "", "a" * 5000, "\0", "..", [], {}, [[]], [None], {"a": 1},
+    [[0] * 4] * 4, {"version": 1}, ["a"] * 3,
+]  # fmt: skip
+
+
+def test_no_value_anywhere_causes_a_traceback(tmp_path: Path, capture: Capture) -> None:
+    """Every value of a file replaced by every strange one, or taken out: a capture or one sentence, nothing else."""
+    text = write_capture(tmp_path, capture).read_text()
+    everywhere = [place for place in places(json.loads(text)) if not (place[0] == "frames" and place[1:2] > (1,))]
+    refused = 0
+    for place in everywhere:
+        for strange in [*STRANGE, "take out"]:
+            meta = json.loads(text)
+            inner = meta
+            for key in place[:-1]:
+                inner = inner[key]
+            if strange == "take out":
+                del inner[place[-1]]
+            else:
+                inner[place[-1]] = strange
+            (tmp_path / "transforms.json").write_text(json.dumps(meta))
+            try:
+                read_capture(tmp_path)
+            except HoloreelError as error:
+                refused += "transforms.json" in str(error)
+    assert refused > len(everywhere) * len(STRANGE) / 2
+
+
 def test_foreign_times_that_cannot_be_frames(tmp_path: Path, capture: Capture) -> None:
     path = edited(write_capture(tmp_path, capture), foreign)
     with pytest.raises(HoloreelError, match="time is missing"):
