@@ -5,11 +5,10 @@ import ctypes
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
+import bpy
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-
-bpy = pytest.importorskip("bpy")
 
 Picture = NDArray[np.float32]
 
