@@ -102,6 +102,9 @@ def make_cameras(scene: bpy.types.Scene, cameras: list[Camera]) -> list[bpy.type
     """Make a camera object for each camera, and make sure that Blender's own reading of it agrees."""
     objects = [new_camera_object(camera, scene.collection) for camera in cameras]
     bpy.context.view_layer.update()
+    scene.cycles.dicing_camera = objects[0]  # subdivision is the same for all cameras
+    for marker in scene.timeline_markers:
+        marker.camera = None  # else the timeline chooses the camera
     for camera, camera_object in zip(cameras, objects, strict=True):
         set_format(scene, camera)
         _set_clipping(camera_object, camera)
@@ -143,7 +146,9 @@ def apply_look(scene: bpy.types.Scene, job: dict[str, Any]) -> None:
     cycles.time_limit = 0.0
     cycles.seed = job["seed"]
     cycles.use_animated_seed = False
+    cycles.sample_offset = 0
     cycles.use_denoising = job["denoise"]
+    cycles.denoiser = "OPENIMAGEDENOISE"
     cycles.film_exposure = 1.0
     cycles.pixel_filter_type, cycles.filter_width = "BLACKMAN_HARRIS", 1.5
     layer = bpy.context.view_layer

@@ -47,6 +47,8 @@ def build(job: dict[str, Any], emit: Emit) -> None:
         aim.target = bpy.data.objects.new("Holoreel Target", None)
         aim.target.location = (0, 0, 0.5)
         scene.collection.objects.link(aim.target)
+        for frame in (1, 4):
+            scene.timeline_markers.new(f"cut {frame}", frame=frame).camera = scene.camera
     bpy.ops.wm.save_as_mainfile(filepath=job["path"], compress=True)
 
 
