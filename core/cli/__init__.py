@@ -2,6 +2,7 @@
 """`holoreel COMMAND ...`: one module per command, imported only when it is asked for."""
 
 import importlib
+import os
 import sys
 
 from ..errors import HoloreelError
@@ -14,6 +15,7 @@ COMMANDS = {
     "render": "render a reel, PLY or .splatv from given cameras",
     "eval": "measure a reel against the held-out views of its capture",
     "info": "say what a reel, PLY, .splatv or capture holds, and what is wrong with it",
+    "demo": "take a scene through the whole loop and write a report",
     "bench": "measure the kernels on this machine",
     "doctor": "say what works on this machine, and how to get what does not",
 }
@@ -44,6 +46,9 @@ def main(arguments: list[str] | None = None) -> int:
     except HoloreelError as error:
         print(f"holoreel {name}: {error}", file=sys.stderr)
         return 2
+    except BrokenPipeError:  # whoever read our output has seen enough
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 0
     except KeyboardInterrupt:
         print(f"\nholoreel {name}: stopped.", file=sys.stderr)
         return 130

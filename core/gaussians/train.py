@@ -4,7 +4,8 @@
 import math
 import time
 from collections import OrderedDict
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from types import ModuleType
 
@@ -52,6 +53,17 @@ class PictureCache:
             while self.bytes > self.limit and len(self.pictures) > 1:
                 self.bytes -= self.pictures.popitem(last=False)[1].nbytes
         return torch.from_numpy(self.pictures[view]).to(torch.float32).mul_(1.0 / 255.0)
+
+
+@contextmanager
+def _single_threaded_torch() -> Iterator[None]:
+    """Keep torch's own threads asleep: they spin while they wait, beside the kernels' threads and at their cost."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)
 
 
 def measure_scene(capture: Capture, points: np.ndarray) -> SceneScale:
@@ -110,6 +122,10 @@ class Trainer:
     def run(self, on_progress: Callable[[Progress], None], until: int | None = None, every: int = 20) -> None:
         """Train up to iteration `until` (default: to the end), reporting every few iterations."""
         until = self.config.iterations if until is None else min(until, self.config.iterations)
+        with _single_threaded_torch():
+            self._run(on_progress, until, every)
+
+    def _run(self, on_progress: Callable[[Progress], None], until: int, every: int) -> None:
         started = time.perf_counter() - self.seconds
         loss_mean = mse_mean = 0.0
         counted = 0
