@@ -170,7 +170,7 @@ def _lock(out: Path) -> Iterator[int]:
     """Hold the folder for one job; Blender gets the open file too, so that the lock lasts as long as the last of us."""
     try:
         out.mkdir(parents=True, exist_ok=True)
-        lock = os.open(out / ".lock", os.O_CREAT | os.O_RDWR)
+        lock = os.open(out / ".lock", os.O_CREAT | os.O_RDWR, 0o644)
     except OSError as error:
         raise HoloreelError(f"{out} cannot be written ({error.strerror}): choose another folder for --out.") from error
     try:
