@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Time and the evaluation of Spacetime Gaussians, as node groups."""
 
+from typing import Any
+
 from ...core.gaussians.model import OPACITY_MIN
 from .. import timeline
 from ..attributes import PREFIX
@@ -11,7 +13,7 @@ from .library import node_group
 TIMELINE_PANEL = "Timeline"
 
 
-def timeline_inputs(tree: Tree) -> dict[str, object]:
+def timeline_inputs(tree: Tree) -> dict[str, Any]:
     """Declare the inputs of the timeline mapping; return them by name."""
     panel = TIMELINE_PANEL
     return {
@@ -31,7 +33,7 @@ def timeline_inputs(tree: Tree) -> dict[str, object]:
     }
 
 
-@node_group("Holoreel Time", 1, "Map the scene's frame to a reel's time; see Timeline in the add-on for the formula")
+@node_group("Holoreel Time", 1, "Map the scene's frame to a reel's time")
 def time(tree: Tree) -> None:
     """Outputs: Time, normalized; Reel Frame. The same as `timeline.Timeline`."""
     inputs = timeline_inputs(tree)

@@ -1,6 +1,10 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """The group that a reel's modifier holds: timeline → evaluation → color → look."""
 
+from typing import Any
+
+import bpy
+
 from .builder import Float, Geometry, Tree
 from .evaluation import evaluate, time, timeline_inputs
 from .library import node_group
@@ -48,5 +52,5 @@ def reel(tree: Tree) -> None:
         tree.set_menu_default(name, default)
 
 
-def _chain(tree: Tree, group: object, inputs: dict[str, object]) -> Geometry:
+def _chain(tree: Tree, group: bpy.types.NodeTree, inputs: dict[str, Any]) -> Geometry:
     return Geometry(tree, tree.group(group, inputs).outputs["Geometry"])
