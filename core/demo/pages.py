@@ -122,7 +122,7 @@ def _slices(pictures: Path, name: str, reel: Path, capture: Capture, truth: list
     """Follow the pixel column that changes most over time."""
     column = int(np.var(np.stack(truth), axis=0).mean(axis=(0, 2)).argmax())
     player, camera = Player(reel), capture.cameras[name]
-    moments = np.arange((capture.frame_count - 1) * SLICE_STEPS + 1) / SLICE_STEPS
+    moments = np.minimum(np.arange(capture.frame_count * SLICE_STEPS) / SLICE_STEPS, capture.frame_count - 1)
     drawn = [np.clip(player.draw(camera, capture.frame_start + float(at)).image, 0, 1) for at in moments]
     strips = {
         "truth": (truth, SLICE_STEPS * SLICE_PIXELS, "Ground truth", f"column {column}, {capture.frame_count} frames"),
