@@ -9,6 +9,7 @@
 #include "frame.hpp"
 #include "projection.hpp"
 #include "thread_pool.hpp"
+#include "vectorize.hpp"
 
 namespace holoreel {
 
@@ -41,9 +42,10 @@ public:
     Ellipse(const Splat& splat, double reach)
         : s_(splat),
           reach_(reach),
+          width_(1.0 / splat.w11),
           // A hair larger than exact: pixels are chosen by their alpha, never by these bounds.
-          radius_x_(std::sqrt(reach * splat.cov_xx) * (1 + 1e-6) + 1e-3),
-          radius_y_(std::sqrt(reach * splat.cov_yy) * (1 + 1e-6) + 1e-3),
+          radius_x_(std::sqrt(std::max(reach, 0.0) * splat.cov_xx) * (1 + 1e-6) + 1e-3),
+          radius_y_(std::sqrt(std::max(reach, 0.0) * splat.cov_yy) * (1 + 1e-6) + 1e-3),
           dy_at_max_x_(radius_x_ * splat.cov_xy / splat.cov_xx) {}
 
     double radius_x() const { return radius_x_; }
@@ -63,13 +65,13 @@ public:
 private:
     void cut(double dy, double& left, double& right) const {
         const double v = s_.w22 * dy;
-        const double half = std::sqrt(std::max(0.0, reach_ - v * v)) / s_.w11, middle = -s_.w12 / s_.w11 * dy;
+        const double half = std::sqrt(std::max(0.0, reach_ - v * v)) * width_, middle = -s_.w12 * width_ * dy;
         left = middle - half;
         right = middle + half;
     }
 
     const Splat& s_;
-    double reach_, radius_x_, radius_y_, dy_at_max_x_;
+    double reach_, width_, radius_x_, radius_y_, dy_at_max_x_;
 };
 
 // Fills the footprint; its rows beyond the inline ones go to `overflow`.
@@ -101,16 +103,16 @@ void lay_out(const Splat& splat, const Ellipse& ellipse, const Frame& frame, Foo
     }
 }
 
-void write_record(const HoloreelGaussians& g, int64_t i, const Instant& instant, const Splat& splat,
+void write_record(const HoloreelGaussians& g, int64_t i, double log_opacity, const Splat& splat,
                   const Ellipse& ellipse, const Frame& frame, float* target) {
     Record& record = *reinterpret_cast<Record*>(target);
-    const double scale = std::sqrt(0.5 * kLog2E);  // exp(-|w|²/2) = 2^-(|scale w|²)
+    constexpr double scale = 0.84932180028801907;  // sqrt(log2(e) / 2): exp(-|w|²/2) = 2^-(|scale w|²)
     record.x = splat.x;
     record.y = splat.y;
     record.w11 = splat.w11 * scale;
     record.w12 = splat.w12 * scale;
     record.w22 = splat.w22 * scale;
-    record.log2_opacity = static_cast<float>(std::log2(instant.opacity));
+    record.log2_opacity = static_cast<float>(log_opacity * kLog2E);
     record.radii = bfloat_up(ellipse.radius_x()) | bfloat_up(ellipse.radius_y()) >> 16;
     float* channels = record.channels();
     for (int c = 0; c < frame.channels; c++) channels[c] = g.features[i * frame.channels + c];
@@ -125,14 +127,38 @@ uint64_t depth_key(double depth, int64_t i) {
     return static_cast<uint64_t>(bits) << 32 | static_cast<uint64_t>(i);
 }
 
+// Evaluates and projects one chunk; writes its keys from its first index on. Returns how many are seen, and their tiles.
+HOLOREEL_HEAVY_CLONES void project_chunk(const HoloreelGaussians& g, const View& view, const HoloreelRules& rules,
+                                         int64_t chunk, Frame& frame, uint64_t* keys, int64_t& visible, int64_t& slots) {
+    const int stride = record_stride(frame.padded_channels);
+    const double log_alpha_min = std::log(rules.alpha_min);
+    auto& overflow = frame.overflow[chunk];
+    overflow.clear();
+    const int64_t begin = chunk * kChunk, end = std::min(begin + kChunk, frame.count);
+    visible = slots = 0;
+    for (int64_t i = begin; i < end; i++) {
+        Footprint& footprint = frame.footprints[i];
+        footprint.tiles = 0;
+        Instant instant;
+        Splat splat;
+        if (!evaluate(g, i, rules, instant) || !project(instant, view, rules, splat)) continue;
+        const double log_opacity = std::log(instant.opacity);
+        const Ellipse ellipse(splat, 2.0 * (log_opacity - log_alpha_min));
+        lay_out(splat, ellipse, frame, footprint, overflow);
+        if (footprint.tiles == 0) continue;
+        write_record(g, i, log_opacity, splat, ellipse, frame, frame.records.data() + i * stride);
+        keys[begin + visible++] = depth_key(splat.depth, i);
+        slots += footprint.tiles;
+    }
+}
+
 }  // namespace
 
 void project_all(const HoloreelGaussians& g, const HoloreelCamera& camera, const HoloreelRules& rules, Frame& frame,
                  Scratch& scratch) {
     const View view(camera, rules);
-    const int stride = record_stride(frame.padded_channels);
     const int64_t chunks = frame.chunks();
-    frame.records.reserve(static_cast<size_t>(frame.count) * stride);
+    frame.records.reserve(static_cast<size_t>(frame.count) * record_stride(frame.padded_channels));
     frame.footprints.reserve(frame.count);
     frame.overflow.resize(chunks);
     scratch.keys.reserve(frame.count);
@@ -140,25 +166,8 @@ void project_all(const HoloreelGaussians& g, const HoloreelCamera& camera, const
     scratch.chunk_visible.assign(chunks + 1, 0);
     scratch.chunk_slots.assign(chunks + 1, 0);
     pool().run(chunks, [&](int64_t chunk) {
-        auto& overflow = frame.overflow[chunk];
-        overflow.clear();
-        const int64_t begin = chunk * kChunk, end = std::min(begin + kChunk, frame.count);
-        int64_t visible = 0, slots = 0;
-        for (int64_t i = begin; i < end; i++) {
-            Footprint& footprint = frame.footprints[i];
-            footprint.tiles = 0;
-            Instant instant;
-            Splat splat;
-            if (!evaluate(g, i, rules, instant) || !project(instant, view, rules, splat)) continue;
-            const Ellipse ellipse(splat, 2.0 * std::log(instant.opacity / rules.alpha_min));
-            lay_out(splat, ellipse, frame, footprint, overflow);
-            if (footprint.tiles == 0) continue;
-            write_record(g, i, instant, splat, ellipse, frame, frame.records.data() + i * stride);
-            scratch.keys_swap[begin + visible++] = depth_key(splat.depth, i);
-            slots += footprint.tiles;
-        }
-        scratch.chunk_visible[chunk + 1] = visible;
-        scratch.chunk_slots[chunk + 1] = slots;
+        project_chunk(g, view, rules, chunk, frame, scratch.keys_swap.data(), scratch.chunk_visible[chunk + 1],
+                      scratch.chunk_slots[chunk + 1]);
     });
     for (int64_t c = 0; c < chunks; c++) {
         scratch.chunk_visible[c + 1] += scratch.chunk_visible[c];

@@ -7,6 +7,7 @@
 #include "frame.hpp"
 #include "projection.hpp"
 #include "thread_pool.hpp"
+#include "vectorize.hpp"
 
 namespace holoreel {
 
@@ -32,7 +33,7 @@ void clear_row(const HoloreelGradients& out, int64_t i, int channels) {
 
 // From the tile sums to the splat: with f = -|w|²/2 and w = W d, df/dmean = Wᵀw and df/dcov = ½ Wᵀ w wᵀ W.
 SplatGradient splat_gradient(const Splat& s, const double* sums) {
-    const double unscale = std::sqrt(2.0 / kLog2E);  // the tiles' u, v are W d times sqrt(log2(e) / 2)
+    constexpr double unscale = 1.1774100225154747;  // sqrt(2 / log2(e)): the tiles' u, v are W d times sqrt(log2(e) / 2)
     const double u = sums[1] * unscale, v = sums[2] * unscale;
     const double uu = sums[3] * 2.0 / kLog2E, uv = sums[4] * 2.0 / kLog2E, vv = sums[5] * 2.0 / kLog2E;
     SplatGradient d;
@@ -55,39 +56,44 @@ void update_density(const HoloreelGradients& out, int64_t i, const Splat& s, con
     }
 }
 
+HOLOREEL_HEAVY_CLONES void gather_chunk(const HoloreelGaussians& g, const View& view, const HoloreelRules& rules,
+                                        int64_t chunk, const Frame& frame, const float* sums, bool with_depth,
+                                        const HoloreelGradients& out) {
+    const int padded = frame.padded_channels, width = kMoments + padded + (with_depth ? 1 : 0);
+    const int64_t end = std::min((chunk + 1) * kChunk, frame.count);
+    for (int64_t i = chunk * kChunk; i < end; i++) {
+        const Footprint& footprint = frame.footprints[i];
+        Instant instant;
+        Splat splat;
+        // The second test always holds for what the forward pass saw, unless the arrays were changed in between.
+        if (!footprint.tiles || !evaluate(g, i, rules, instant) || !project(instant, view, rules, splat)) {
+            clear_row(out, i, frame.channels);
+            continue;
+        }
+        double total[kMoments + kMaxChannels + 1] = {};
+        const float* place = sums + static_cast<int64_t>(footprint.slot) * width;
+        for (uint32_t tile = 0; tile < footprint.tiles; tile++, place += width)
+            for (int k = 0; k < width; k++) total[k] += place[k];
+        SplatGradient d_splat = splat_gradient(splat, total);
+        if (with_depth) d_splat.depth = total[kMoments + padded];
+        InstantGradient d_instant;
+        project_backward(instant, view, d_splat, d_instant);
+        d_instant.opacity = total[0] / instant.opacity;
+        evaluate_backward(g, i, rules, instant, d_instant, out);
+        if (out.features)
+            for (int c = 0; c < frame.channels; c++)
+                out.features[i * frame.channels + c] = static_cast<float>(total[kMoments + c]);
+        update_density(out, i, splat, d_splat);
+    }
+}
+
 }  // namespace
 
 void gather_gradients(const HoloreelGaussians& g, const HoloreelCamera& camera, const HoloreelRules& rules,
                       const Frame& frame, const float* sums, bool with_depth, const HoloreelGradients& out) {
     const View view(camera, rules);
-    const int padded = frame.padded_channels, width = kMoments + padded + (with_depth ? 1 : 0);
-    pool().run(frame.chunks(), [&](int64_t chunk) {
-        const int64_t end = std::min((chunk + 1) * kChunk, frame.count);
-        for (int64_t i = chunk * kChunk; i < end; i++) {
-            const Footprint& footprint = frame.footprints[i];
-            Instant instant;
-            Splat splat;
-            // The second test always holds for what the forward pass saw, unless the arrays were changed in between.
-            if (!footprint.tiles || !evaluate(g, i, rules, instant) || !project(instant, view, rules, splat)) {
-                clear_row(out, i, frame.channels);
-                continue;
-            }
-            double total[kMoments + kMaxChannels + 1] = {};
-            const float* place = sums + static_cast<int64_t>(footprint.slot) * width;
-            for (uint32_t tile = 0; tile < footprint.tiles; tile++, place += width)
-                for (int k = 0; k < width; k++) total[k] += place[k];
-            SplatGradient d_splat = splat_gradient(splat, total);
-            if (with_depth) d_splat.depth = total[kMoments + padded];
-            InstantGradient d_instant;
-            project_backward(instant, view, d_splat, d_instant);
-            d_instant.opacity = total[0] / instant.opacity;
-            evaluate_backward(g, i, rules, instant, d_instant, out);
-            if (out.features)
-                for (int c = 0; c < frame.channels; c++)
-                    out.features[i * frame.channels + c] = static_cast<float>(total[kMoments + c]);
-            update_density(out, i, splat, d_splat);
-        }
-    });
+    pool().run(frame.chunks(),
+               [&](int64_t chunk) { gather_chunk(g, view, rules, chunk, frame, sums, with_depth, out); });
 }
 
 }  // namespace holoreel

@@ -1,10 +1,18 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-// Plain loops that the compiler turns into vectors: on x86 Linux it makes an AVX2 copy too, chosen when the library is loaded.
-// Products and sums stay separate (-ffp-contract=off), so both copies give the same bits.
+// Copies of a function for newer processors, made by the compiler and chosen when the library is loaded: on x86 Linux.
+// Elsewhere there is one copy, and everything works the same.
 #pragma once
 
+// For plain loops over arrays. Products and sums stay separate (-ffp-contract=off), so all copies give the same bits.
 #if defined(__x86_64__) && defined(__gnu_linux__)
 #define HOLOREEL_CLONES __attribute__((target_clones("avx2", "default")))
 #else
 #define HOLOREEL_CLONES
+#endif
+
+// For work in double precision on one Gaussian after another, with everything it calls put inside (GCC only).
+#if defined(__x86_64__) && defined(__gnu_linux__) && !defined(__clang__)
+#define HOLOREEL_HEAVY_CLONES __attribute__((target_clones("arch=haswell", "default"), flatten))
+#else
+#define HOLOREEL_HEAVY_CLONES
 #endif
