@@ -36,28 +36,36 @@ struct PixelGradients {
     PixelGradients(const TileJob& job, const Tile& t) {
         for (int k = 0; k < t.rows * kGroups; k++) {
             float g[C][kLanes] = {}, z[kLanes] = {}, gz[kLanes] = {}, s[kLanes] = {};
-            const int64_t first = t.pixel(k);
-            for (int lane = 0, lanes = t.lanes_inside(k); lane < lanes; lane++) {
-                const int64_t pixel = first + lane;
-                const float alpha = job.alpha[pixel];
-                double sum = 0.0;
-                if (job.grad_features)
-                    for (int c = 0; c < job.channels; c++) {
-                        g[c][lane] = job.grad_features[pixel * job.channels + c];
-                        sum += static_cast<double>(g[c][lane]) * job.features[pixel * job.channels + c];
-                    }
-                if (job.grad_alpha) sum -= static_cast<double>(job.grad_alpha[pixel]) * job.transmittance[pixel];
-                s[lane] = static_cast<float>(sum);
-                if (kDepth && alpha > 0.0f) {
-                    z[lane] = job.depth[pixel];
-                    gz[lane] = job.grad_depth[pixel] / alpha;
-                }
-            }
+            if (job.channels == C)
+                read(job, t.pixel(k), t.lanes_inside(k), C, g, z, gz, s);
+            else
+                read(job, t.pixel(k), t.lanes_inside(k), job.channels, g, z, gz, s);
             for (int c = 0; c < C; c++) features[k][c] = load(g[c]);
             behind[k] = load(s);
             if (kDepth) {
                 depth[k] = load(z);
                 depth_gradient[k] = load(gz);
+            }
+        }
+    }
+
+    // One vector's pixels. Called with a constant number of channels where that saves a loop.
+    HOLOREEL_INLINE void read(const TileJob& job, int64_t first, int lanes, int channels, float (*g)[kLanes], float* z,
+                              float* gz, float* s) {
+        for (int lane = 0; lane < lanes; lane++) {
+            const int64_t pixel = first + lane;
+            const float alpha = job.alpha[pixel];
+            double sum = 0.0;
+            if (job.grad_features)
+                for (int c = 0; c < channels; c++) {
+                    g[c][lane] = job.grad_features[pixel * channels + c];
+                    sum += static_cast<double>(g[c][lane]) * job.features[pixel * channels + c];
+                }
+            if (job.grad_alpha) sum -= static_cast<double>(job.grad_alpha[pixel]) * job.transmittance[pixel];
+            s[lane] = static_cast<float>(sum);
+            if (kDepth && alpha > 0.0f) {
+                z[lane] = job.depth[pixel];
+                gz[lane] = job.grad_depth[pixel] / alpha;
             }
         }
     }

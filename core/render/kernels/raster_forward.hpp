@@ -7,6 +7,23 @@
 namespace holoreel {
 namespace HOLOREEL_NAMESPACE {
 
+// Writes pixel after pixel what lies channel after channel. Called with a constant where that saves a loop.
+template <int C>
+HOLOREEL_INLINE void interleave(const float (*values)[kLanes], int lanes, int channels, float* out) {
+    for (int lane = 0; lane < lanes; lane++, out += channels)
+        for (int c = 0; c < channels; c++) out[c] = values[c][lane];
+}
+
+HOLOREEL_INLINE void store_first(float* out, F value, int lanes) {
+    if (lanes == kLanes) {
+        store(out, value);
+        return;
+    }
+    float values[kLanes];
+    store(values, value);
+    for (int lane = 0; lane < lanes; lane++) out[lane] = values[lane];
+}
+
 template <int C, bool kDepth>
 void forward_tile(const TileJob& job, int tile) {
     constexpr int kSums = C + (kDepth ? 2 : 0);  // with depth: the sums of w z and of w
@@ -50,20 +67,23 @@ void forward_tile(const TileJob& job, int tile) {
         }
     }
 
+    F background[C];
+    for (int c = 0; c < C; c++) background[c] = set1(job.background && c < job.channels ? job.background[c] : 0.0f);
     for (int k = 0; k < t.rows * kGroups; k++) {
-        float rest[kLanes], values[kSums][kLanes];
-        store(rest, abs(transmittance[k]));
-        for (int c = 0; c < kSums; c++) store(values[c], sums[k][c]);
+        const F rest = abs(transmittance[k]);
+        float values[C][kLanes];
+        for (int c = 0; c < C; c++) store(values[c], fma(rest, background[c], sums[k][c]));
+        const int lanes = t.lanes_inside(k);
         const int64_t first = t.pixel(k);
-        for (int lane = 0, lanes = t.lanes_inside(k); lane < lanes; lane++) {
-            float* features = job.features + (first + lane) * job.channels;
-            for (int c = 0; c < job.channels; c++)
-                features[c] = values[c][lane] + (job.background ? rest[lane] * job.background[c] : 0.0f);
-            const float covered = kDepth ? values[kSums - 1][lane] : 1.0f - rest[lane];
-            job.alpha[first + lane] = covered;
-            if (job.transmittance) job.transmittance[first + lane] = rest[lane];
-            if (kDepth) job.depth[first + lane] = covered > 0.0f ? values[C][lane] / covered : 0.0f;
-        }
+        float* features = job.features + first * job.channels;
+        if (job.channels == C)
+            interleave<C>(values, lanes, C, features);
+        else
+            interleave<C>(values, lanes, job.channels, features);
+        const F covered = kDepth ? sums[k][kSums - 1] : sub(set1(1.0f), rest);
+        store_first(job.alpha + first, covered, lanes);
+        if (job.transmittance) store_first(job.transmittance + first, rest, lanes);
+        if (kDepth) store_first(job.depth + first, keep(gt(covered, set1(0.0f)), div(sums[k][C], covered)), lanes);
     }
 }
 
