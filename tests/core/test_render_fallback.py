@@ -65,7 +65,7 @@ def test_number_of_threads(monkeypatch, text, threads):
         with pytest.raises(HoloreelError, match="HOLOREEL_THREADS"):
             native.load_kernels()
     else:
-        assert native.load_kernels().holoreel_get_threads() == threads or native.available_cores()
+        assert native.load_kernels().holoreel_get_threads() == (threads or native.available_cores())
     native.load_kernels.cache_clear()
 
 
