@@ -34,29 +34,32 @@ struct Window {
 };
 
 // out[i] = sum over k of taps[|k|] in[i + k step]; `in` may be read kReach steps beyond both ends.
-HOLOREEL_CLONES void blur_line(const float* in, int step, int count, const float* taps, float* out) {
-    for (int i = 0; i < count; i++) {
-        float sum = taps[0] * in[i];
-        for (int k = 1; k <= kReach; k++) sum += taps[k] * (in[i - k * step] + in[i + k * step]);
-        out[i] = sum;
-    }
+HOLOREEL_CLONES void blur_line(const float* in, int step, int count, const float* taps, float* __restrict out) {
+    const float t0 = taps[0], t1 = taps[1], t2 = taps[2], t3 = taps[3], t4 = taps[4], t5 = taps[5];
+    const float *l1 = in - step, *l2 = l1 - step, *l3 = l2 - step, *l4 = l3 - step, *l5 = l4 - step;
+    const float *r1 = in + step, *r2 = r1 + step, *r3 = r2 + step, *r4 = r3 + step, *r5 = r4 + step;
+    for (int i = 0; i < count; i++)
+        out[i] = t0 * in[i] + t1 * (l1[i] + r1[i]) + t2 * (l2[i] + r2[i]) + t3 * (l3[i] + r3[i]) +
+                 t4 * (l4[i] + r4[i]) + t5 * (l5[i] + r5[i]);
 }
 
 // out[i] = sum over k of taps[|k|] rows[kReach + k][i].
-HOLOREEL_CLONES void blur_column(const float* const* rows, int count, const float* taps, float* out) {
+HOLOREEL_CLONES void blur_column(const float* const* rows, int count, const float* taps, float* __restrict out) {
     const float *r0 = rows[0], *r1 = rows[1], *r2 = rows[2], *r3 = rows[3], *r4 = rows[4], *r5 = rows[5];
     const float *r6 = rows[6], *r7 = rows[7], *r8 = rows[8], *r9 = rows[9], *r10 = rows[10];
+    const float t0 = taps[0], t1 = taps[1], t2 = taps[2], t3 = taps[3], t4 = taps[4], t5 = taps[5];
     for (int i = 0; i < count; i++)
-        out[i] = taps[0] * r5[i] + taps[1] * (r4[i] + r6[i]) + taps[2] * (r3[i] + r7[i]) + taps[3] * (r2[i] + r8[i]) +
-                 taps[4] * (r1[i] + r9[i]) + taps[5] * (r0[i] + r10[i]);
+        out[i] = t0 * r5[i] + t1 * (r4[i] + r6[i]) + t2 * (r3[i] + r7[i]) + t3 * (r2[i] + r8[i]) +
+                 t4 * (r1[i] + r9[i]) + t5 * (r0[i] + r10[i]);
 }
 
-HOLOREEL_CLONES void multiply(const float* a, const float* b, int count, float* out) {
+HOLOREEL_CLONES void multiply(const float* a, const float* b, int count, float* __restrict out) {
     for (int i = 0; i < count; i++) out[i] = a[i] * b[i];
 }
 
 // SSIM of one row from its blurred x, y, x², y², x y; and dSSIM/d(blurred x), /d(blurred x²), /d(blurred x y).
-HOLOREEL_CLONES void ssim_row(const float* const* m, int count, float* ssim, float* d_x, float* d_xx, float* d_xy) {
+HOLOREEL_CLONES void ssim_row(const float* const* m, int count, float* __restrict ssim, float* __restrict d_x,
+                              float* __restrict d_xx, float* __restrict d_xy) {
     const float *mx = m[0], *my = m[1], *mxx = m[2], *myy = m[3], *mxy = m[4];
     for (int i = 0; i < count; i++) {
         const float x = mx[i], y = my[i];
@@ -71,11 +74,12 @@ HOLOREEL_CLONES void ssim_row(const float* const* m, int count, float* ssim, flo
 }
 
 HOLOREEL_CLONES void gradient_row(const float* x, const float* y, const float* const* d, int count, float l1_share,
-                                  float ssim_share, float* out) {
+                                  float ssim_share, float* __restrict out) {
+    const float *d_x = d[0], *d_xx = d[1], *d_xy = d[2];
     for (int i = 0; i < count; i++) {
         const float difference = x[i] - y[i];
         const float sign = static_cast<float>(difference > 0.0f) - static_cast<float>(difference < 0.0f);
-        out[i] = l1_share * sign - ssim_share * (d[0][i] + 2 * x[i] * d[1][i] + y[i] * d[2][i]);
+        out[i] = l1_share * sign - ssim_share * (d_x[i] + 2 * x[i] * d_xx[i] + y[i] * d_xy[i]);
     }
 }
 
