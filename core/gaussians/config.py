@@ -8,25 +8,25 @@ from dataclasses import dataclass, field
 class LearningRates:
     """Adam step sizes. Positions and motions are in footprints: what one pixel covers at the scene's median depth."""
 
-    means: float = 0.1
+    means: float = 0.3
     """footprints per step, decaying to `means_final`"""
     means_final: float = 0.01
     """footprints per step at the end"""
-    motions: float = 0.2
+    motions: float = 0.6
     """footprints per step and segment, for b_1, b_2 and b_3 alike"""
-    features: float = 5e-3
+    features: float = 0.015
     """display-referred color"""
     opacities: float = 0.05
     """logit"""
-    scales: float = 7e-3
+    scales: float = 0.02
     """log scale"""
-    quats: float = 2e-3
+    quats: float = 6e-3
     """raw quaternion at the temporal center"""
-    omegas: float = 4e-3
+    omegas: float = 0.01
     """raw change of the quaternion over a segment"""
     trbf_centers: float = 1e-3
     """segments"""
-    trbf_scales: float = 0.02
+    trbf_scales: float = 0.04
     """log width"""
     final_factor: float = 0.1
     """all rates but that of the positions decay to this part of themselves"""
@@ -42,7 +42,7 @@ class DensityConfig:
     """last densification"""
     events: int = 6
     """how many densifications lie between"""
-    gradient: float = 2e-4
+    gradient: float = 8e-4
     """a Gaussian is cloned or split where the loss pulls its projected mean harder than this, per half image width"""
     split_footprints: float = 3.0
     """larger Gaussians are split in two, smaller ones are cloned"""
@@ -64,13 +64,13 @@ class DensityConfig:
 class TrainConfig:
     """One training run of a Spacetime Gaussian reel."""
 
-    iterations: int = 6000
+    iterations: int = 3500
     """steps; each looks at one picture"""
     seed: int = 0
     """of the run's one random generator"""
     dssim_weight: float = 0.2
     """loss = (1 − w) L1 + w (1 − SSIM) (Sec. 4.3)"""
-    max_seeds: int = 60_000
+    max_seeds: int = 40_000
     """at most this many Gaussians to begin with"""
     seed_opacity: float = 0.3
     """opacity of a fresh Gaussian"""
