@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """The steps of the loop, in order; each leaves files that the next one and the report read."""
 
-import os
-import platform
 import shutil
 import time
 from collections.abc import Callable
@@ -22,13 +20,14 @@ from ..gaussians.run import train_reel
 from ..images import read_image, write_png
 from ..metrics import psnr
 from ..render import get_backend
+from ..render.bench import machine
 from ..rig import RigRequest
 from ..synth import SynthJob, synthesize
 from .pages import write_pages
 from .path import orbit
 
 EEVEE_PICTURES = 2  # the software OpenGL of a machine without a GPU takes its time
-SUBFRAMES = 2  # pictures of the moving camera per frame of the reel
+MOVING_PICTURES = 16  # of the moving camera, spread over the reel, sub-frames included
 OnProgress = Callable[[int, int], None]
 
 
@@ -165,16 +164,17 @@ def _render(
 
 def _move(settings: DemoSettings, reel: Path, capture: Capture, show: OnProgress) -> None:
     """Render a new camera that moves while the reel plays, sub-frames included, and save the scene that does so."""
-    count = capture.frame_count * SUBFRAMES
-    cameras = orbit(list(capture.cameras.values()), count)
+    last = capture.frame_count - 1
+    cameras = orbit(list(capture.cameras.values()), MOVING_PICTURES)
+    moments = [index / (MOVING_PICTURES - 1) * last for index in range(MOVING_PICTURES)]  # in frames of the reel
     setting = {"reel": str(reel.absolute()), "background": list(Player(reel).first.background)}
     shots = [
         {
             "camera": camera.to_json(),
-            "time": index / count * (1 - 1 / capture.frame_count),
+            "time": moment / capture.frame_count,
             "out": str((settings.out / "moving" / f"{index:04d}.png").absolute()),
         }
-        for index, camera in enumerate(cameras)
+        for index, (camera, moment) in enumerate(zip(cameras, moments, strict=True))
     ]
     log = settings.out / "moving" / "blender.log"
     run_in_blender(
@@ -184,11 +184,7 @@ def _move(settings: DemoSettings, reel: Path, capture: Capture, show: OnProgress
         log=log,
         on_event=lambda event: show(event["index"] + 1, event["count"]),
     )
-    path = [
-        (capture.frame_start + index / SUBFRAMES, camera.to_json())
-        for index, camera in enumerate(cameras)
-        if index % SUBFRAMES == 0
-    ]
+    path = [(capture.frame_start + moment, camera.to_json()) for camera, moment in zip(cameras, moments, strict=True)]
     stage = {"out": str((settings.out / "scene.blend").absolute()), "path": path}
     run_in_blender(settings.blender, "holoreel.addon.render:save_scene", {"setting": setting, "stage": stage}, log=log)
 
@@ -214,20 +210,5 @@ def _metrics(settings: DemoSettings, results: Results) -> dict[str, Any]:
         "size": [settings.width, settings.height],
         "samples": settings.samples,
         "blender": results.blender,
-        "machine": {
-            "processor": _processor(),
-            "cores": len(os.sched_getaffinity(0)),
-            "python": platform.python_version(),
-        },
+        "machine": machine(),
     }
-
-
-def _processor() -> str:
-    """Name the processor as the system does."""
-    try:
-        for line in Path("/proc/cpuinfo").read_text().splitlines():
-            if line.startswith("model name"):
-                return line.partition(":")[2].strip()
-    except OSError:
-        pass
-    return platform.processor() or platform.machine()

@@ -80,6 +80,8 @@ class TrainConfig:
     """temporal width, in segments, of seeds that are there in some frames only"""
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """color behind everything, where a capture is transparent"""
+    clamp_colors: bool = True
+    """keep colors in [0, 1], where every viewer shows them alike (EEVEE drops negative light, .splatv has 8 bits)"""
     checkpoint_every: int = 1000
     """iterations between two checkpoints"""
     rates: LearningRates = field(default_factory=LearningRates)

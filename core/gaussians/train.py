@@ -155,6 +155,9 @@ class Trainer:
         loss = self.backend.l1_dssim(rendering.features, target, self.config.dssim_weight)
         loss.backward()
         self.parameters.step(self._rates(), self.backend)
+        if self.config.clamp_colors:
+            with torch.no_grad():
+                self.parameters.tensors["features"].clamp_(0.0, 1.0)
         self.iteration += 1
         mse = float((rendering.features.detach() - target).square().mean())
         self._control_density(camera.width)
