@@ -9,8 +9,9 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import tyro
 
 from ..errors import HoloreelError
+from ..machine import machine
 from ..render import get_backend
-from ..render.native import TIMINGS
+from ..render.native import TIMINGS, set_lanes
 
 if TYPE_CHECKING:  # the measuring itself needs torch, which --help need not wait for
     from ..render.bench import Row
@@ -37,9 +38,9 @@ def run(
     get_backend("cpu")
     from ..render import bench
 
-    machine = bench.machine()
+    hardware = {**machine(), "lanes": set_lanes(0)}
     print(
-        f"{machine['processor']}, {machine['cores']} cores, {machine['lanes']} lanes; whole chain, milliseconds, "
+        f"{hardware['processor']}, {hardware['cores']} cores, {hardware['lanes']} lanes; whole chain, milliseconds, "
         f"medians of {rounds}"
     )
     print(HEADER)
@@ -54,7 +55,7 @@ def run(
     if reference:
         rows += _against_reference(rounds)
     if json is not None:
-        _write(json, {"machine": machine, "rows": [row.as_dict() for row in rows]})
+        _write(json, {"machine": hardware, "rows": [row.as_dict() for row in rows]})
 
 
 HEADER = (

@@ -18,9 +18,9 @@ from ..files import write_json
 from ..gaussians.config import PRESETS
 from ..gaussians.run import train_reel
 from ..images import read_image, write_png
+from ..machine import machine
 from ..metrics import psnr
 from ..render import get_backend
-from ..render.bench import machine
 from ..rig import RigRequest
 from ..synth import SynthJob, synthesize
 from .pages import write_pages

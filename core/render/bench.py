@@ -2,12 +2,10 @@
 """Measure the rasterizers: the whole chain from raw parameters to pictures and back, and its parts."""
 
 import itertools
-import platform
 import statistics
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass, field
-from pathlib import Path
 from types import ModuleType
 
 import torch
@@ -57,19 +55,6 @@ class Row:
     def as_dict(self) -> dict[str, object]:
         """Return the row for JSON."""
         return asdict(self)
-
-
-def machine() -> dict[str, object]:
-    """Return the processor's name, the cores this process may use, and the versions that matter."""
-    name = platform.processor() or platform.machine()
-    info = Path("/proc/cpuinfo")
-    if info.is_file():
-        names = [
-            line.split(":", 1)[1].strip() for line in info.read_text().splitlines() if line.startswith("model name")
-        ]
-        name = names[0] if names else name
-    lanes = native.set_lanes(0)
-    return {"processor": name, "cores": native.available_cores(), "lanes": lanes, "torch": torch.__version__}
 
 
 def setups() -> Iterator[Setup]:
