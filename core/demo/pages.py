@@ -105,7 +105,10 @@ def _comparison(out: Path, pictures: Path, name: str, capture: Capture, truth: l
 def _moving(out: Path, pictures: Path) -> Section:
     frames = [read_image(path)[..., :3] for path in sorted((out / "moving").glob("*.png"))]
     write_animation(pictures / "moving.webp", frames, fps=len(frames) / 3)
-    write_png(pictures / "moving.png", contact_sheet(frames[:: max(len(frames) // 8, 1)][:8], columns=4))
+    write_png(
+        pictures / "moving.png",
+        contact_sheet([frames[index] for index in np.linspace(0, len(frames) - 1, 9).round().astype(int)], columns=3),
+    )
     return Section(
         "A new camera, moving while the reel plays",
         "Rendered by Cycles from the imported reel, in slow motion: sub-frames are evaluated like any other time.",
