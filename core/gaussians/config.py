@@ -54,7 +54,7 @@ class DensityConfig:
     """iterations between two prunings"""
     prune_depth: float = 0.2
     """Gaussians nearer to a training camera than this part of the nearest seed are deleted"""
-    reset_at: tuple[float, ...] = ()
+    reset_at: tuple[float, ...] = (0.3,)
     """opacities are capped at `reset_opacity` at these parts of the run"""
     reset_opacity: float = 0.01
     """the cap of a reset"""
