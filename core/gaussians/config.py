@@ -48,14 +48,15 @@ class DensityConfig:
     """larger Gaussians are split in two, smaller ones are cloned"""
     max_gaussians: int = 150_000
     """never grow beyond this number"""
-    prune_opacity: float = 0.005
+    prune_opacity: float = 0.02
     """Gaussians whose opacity stays under this at all frames are deleted"""
     prune_every: int = 100
     """iterations between two prunings"""
     prune_depth: float = 0.2
     """Gaussians nearer to a training camera than this part of the nearest seed are deleted"""
-    reset_at: tuple[float, ...] = (0.3,)
-    """opacities are capped at `reset_opacity` at these parts of the run"""
+    reset_at: tuple[float, ...] = ()
+    """opacities are capped at `reset_opacity` at these parts of the run; a short run is better off without: what comes
+    back is fainter, and pictures need more layers of it"""
     reset_opacity: float = 0.01
     """the cap of a reset"""
 
