@@ -35,7 +35,7 @@ build/.system: scripts/setup.sh
 	@touch $@
 
 demo: setup
-	@.venv/bin/python -m holoreel.core demo --out demo --blender "$$(ls .venv-bpy52/bin/python .venv-bpy45/bin/python 2>/dev/null | head -n 1)"
+	@.venv/bin/python -m holoreel.core demo --out demo --blender "$$(ls -r .venv-bpy*/bin/python 2>/dev/null | head -n 1)"
 
 lint: .venv/.ready .venv/.kernels
 	.venv/bin/ruff format --check .
