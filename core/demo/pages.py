@@ -33,10 +33,7 @@ def write_pages(out: Path, title: str, reel: Path, capture: Capture, metrics: di
     """Write `report.html` and its pictures into `out`, from what the steps of the loop left there."""
     pictures = out / "report"
     name = capture.camera_names("test")[0]
-    truth = [
-        capture.image(name, j, background=(0, 0, 0)).astype(np.float32) / np.float32(255)
-        for j in range(capture.frame_count)
-    ]
+    truth = [_picture(capture, name, frame) for frame in range(capture.frame_count)]
     write_report(
         out / "report.html",
         Report(
@@ -142,10 +139,7 @@ def _slices(pictures: Path, name: str, reel: Path, capture: Capture, truth: list
 
 def _capture(pictures: Path, capture: Capture) -> Section:
     middle = capture.frame_count // 2
-    views = [
-        capture.image(name, middle, background=(0, 0, 0)).astype(np.float32) / np.float32(255)
-        for name in capture.cameras
-    ]
+    views = [_picture(capture, name, middle) for name in capture.cameras]
     write_png(pictures / "capture.png", contact_sheet(views, columns=4))
     held_out = set(capture.camera_names("test"))
     plot_rig(pictures / "rig.svg", list(capture.cameras.values()), held_out, capture.seed_points(0).xyz)

@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 
 from ..render.contract import DensityStats
+from ..render.reference import rotation_matrices
 from .config import DensityConfig
 from .parameters import Parameters
 
@@ -62,22 +63,9 @@ def _child(rows: dict[str, Tensor], rng: torch.Generator) -> dict[str, Tensor]:
     """Move a Gaussian to a random place inside itself and shrink it."""
     scales = rows["log_scales"].exp()
     offset = torch.randn(scales.shape, generator=rng) * scales
-    rows["means"] = rows["means"] + torch.einsum("nij,nj->ni", rotations(rows["quats"]), offset)
+    rows["means"] = rows["means"] + torch.einsum("nij,nj->ni", rotation_matrices(rows["quats"]), offset)
     rows["log_scales"] = (scales / SPLIT_SHRINK).log()
     return rows
-
-
-def rotations(quats: Tensor) -> Tensor:
-    """Return the rotation matrices (N, 3, 3) of unnormalized w x y z quaternions (N, 4); zero means no rotation."""
-    norms = quats.norm(dim=1, keepdim=True)
-    identity = torch.tensor([1.0, 0.0, 0.0, 0.0])
-    w, x, y, z = torch.where(norms > 0, quats / norms.clamp(min=1e-20), identity).unbind(1)
-    rows = [
-        1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
-        2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
-        2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
-    ]  # fmt: skip
-    return torch.stack(rows, dim=1).reshape(-1, 3, 3)
 
 
 def peak_opacity(parameters: Parameters, times: Tensor) -> Tensor:

@@ -2,6 +2,8 @@
 """Training of Spacetime Gaussians from a capture (Spacetime Gaussians, Sec. 4.3)."""
 
 import math
+import signal
+import threading
 import time
 from collections import OrderedDict
 from collections.abc import Callable, Iterator, Mapping
@@ -66,6 +68,25 @@ def _single_threaded_torch() -> Iterator[None]:
         torch.set_num_threads(threads)
 
 
+@contextmanager
+def _interrupts_between_steps() -> Iterator[Callable[[], None]]:
+    """Hold Ctrl-C back, which Python may raise half-way through an optimizer step; yield what raises it when called."""
+    caught: list[int] = []
+
+    def check() -> None:
+        if caught:
+            raise KeyboardInterrupt
+
+    if threading.current_thread() is not threading.main_thread():  # others get no signals, and may not ask for them
+        yield check
+        return
+    before = signal.signal(signal.SIGINT, lambda number, _frame: caught.append(number))
+    try:
+        yield check
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
 def measure_scene(capture: Capture, points: np.ndarray) -> SceneScale:
     """Measure what one pixel covers at the seeds' median depth, and how near the seeds come to the training cameras."""
     footprints, nearest = [], math.inf
@@ -120,12 +141,17 @@ class Trainer:
         self.reset_at = {round(part * config.iterations) for part in config.density.reset_at}
 
     def run(self, on_progress: Callable[[Progress], None], until: int | None = None, every: int = 20) -> None:
-        """Train up to iteration `until` (default: to the end), reporting every few iterations."""
-        until = self.config.iterations if until is None else min(until, self.config.iterations)
-        with _single_threaded_torch():
-            self._run(on_progress, until, every)
+        """Train up to iteration `until` (default: to the end), reporting every few iterations.
 
-    def _run(self, on_progress: Callable[[Progress], None], until: int, every: int) -> None:
+        Ctrl-C raises KeyboardInterrupt between two steps, so that `state` is whole.
+        """
+        until = self.config.iterations if until is None else min(until, self.config.iterations)
+        with _single_threaded_torch(), _interrupts_between_steps() as check_interrupt:
+            self._run(on_progress, check_interrupt, until, every)
+
+    def _run(
+        self, on_progress: Callable[[Progress], None], check_interrupt: Callable[[], None], until: int, every: int
+    ) -> None:
         started = time.perf_counter() - self.seconds
         loss_mean = mse_mean = 0.0
         counted = 0
@@ -144,6 +170,7 @@ class Trainer:
                 )
                 loss_mean = mse_mean = 0.0
                 counted = 0
+            check_interrupt()
 
     def step(self) -> tuple[float, float]:
         """Look at one picture and learn from it; return the loss and the mean squared error."""

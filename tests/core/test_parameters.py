@@ -5,10 +5,11 @@ import numpy as np
 import pytest
 import torch
 from holoreel.core.gaussians.config import DensityConfig
-from holoreel.core.gaussians.density import SceneScale, densify, empty_stats, prune, reset_opacities, rotations
+from holoreel.core.gaussians.density import SceneScale, densify, empty_stats, prune, reset_opacities
 from holoreel.core.gaussians.model import SpacetimeGaussians
 from holoreel.core.gaussians.parameters import BETAS, EPSILON, Parameters
 from holoreel.core.render import reference
+from holoreel.core.render.reference import rotation_matrices
 
 SCENE = SceneScale(footprint=0.01, nearest=1.0, centers=torch.zeros(1, 3))
 
@@ -113,8 +114,10 @@ def test_reset_caps_opacities_and_forgets_their_momentum() -> None:
 
 
 def test_rotations_are_rotations_and_zero_is_none() -> None:
-    matrices = rotations(torch.cat([torch.randn(20, 4, generator=torch.Generator().manual_seed(0)), torch.zeros(1, 4)]))
+    matrices = rotation_matrices(
+        torch.cat([torch.randn(20, 4, generator=torch.Generator().manual_seed(0)), torch.zeros(1, 4)])
+    )
     torch.testing.assert_close(matrices @ matrices.mT, torch.eye(3).expand(21, 3, 3), rtol=0, atol=1e-5)
     assert torch.equal(matrices[-1], torch.eye(3))
-    quarter = rotations(torch.tensor([[1.0, 0.0, 0.0, 1.0]]))[0]  # 90° about z takes x to y
+    quarter = rotation_matrices(torch.tensor([[1.0, 0.0, 0.0, 1.0]]))[0]  # 90° about z takes x to y
     torch.testing.assert_close(quarter[:, 0], torch.tensor([0.0, 1.0, 0.0]))

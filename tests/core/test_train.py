@@ -2,6 +2,7 @@
 """Training: it learns a scene it can check, resumes bit for bit, and refuses what cannot work."""
 
 import json
+import signal
 from pathlib import Path
 
 import imageio.v3 as imageio
@@ -141,6 +142,35 @@ def test_interrupted_run_leaves_a_checkpoint_and_resumes_to_a_reel(capture: Capt
     record = json.loads(paths.record.read_text())
     assert record["gaussians"] == len(loaded.gaussians)
     assert record["config"]["iterations"] == 40
+
+
+def test_ctrl_c_in_the_middle_of_a_step_leaves_a_whole_state(capture: Capture, tmp_path: Path) -> None:
+    backend, out = get_backend(), tmp_path / "d.reel"
+    calls = 0
+
+    class Interrupting:
+        """The backend, but Ctrl-C comes between the Adam steps of two tensors."""
+
+        def __getattr__(self, name: str) -> object:
+            return getattr(backend, name)
+
+        def adam_step(self, *arguments: object) -> None:
+            nonlocal calls
+            calls += 1
+            if calls == 13 * 9 + 4:
+                signal.raise_signal(signal.SIGINT)
+            backend.adam_step(*arguments)
+
+    before = signal.getsignal(signal.SIGINT)
+    with pytest.raises(KeyboardInterrupt):
+        train_reel(capture, out, QUICK, Interrupting(), lambda progress: None)
+    assert signal.getsignal(signal.SIGINT) is before
+    assert torch.load(RunPaths(out).checkpoint, weights_only=True)["iteration"] == 14
+    resumed = train_reel(capture, out, QUICK, backend, lambda progress: None, resume=True)
+    straight = Trainer(capture, QUICK, backend)
+    straight.run(lambda progress: None)
+    for name, value in straight.parameters.tensors.items():
+        assert torch.equal(value, resumed.parameters.tensors[name]), name
 
 
 def test_command_trains_and_says_what_it_made(capture: Capture, tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
