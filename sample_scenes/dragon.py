@@ -7,7 +7,6 @@ Run with Blender's Python, `python sample_scenes/dragon.py`. Plays over frames 1
 from __future__ import annotations
 
 import math
-from pathlib import Path
 
 import bpy
 import numpy as np
@@ -410,7 +409,4 @@ def build() -> bpy.types.Scene:
 
 
 if __name__ == "__main__":
-    path = Path(__file__).with_suffix(".blend")
-    build()
-    kit.save(path)
-    print(f"wrote {path.name}: {path.stat().st_size / 1024:.0f} KiB")
+    kit.write(__file__, build)

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import itertools
 import math
-from pathlib import Path
 
 import bpy
 import numpy as np
@@ -418,7 +417,4 @@ def build() -> bpy.types.Scene:
 
 
 if __name__ == "__main__":
-    path = Path(__file__).with_suffix(".blend")
-    build()
-    kit.save(path)
-    print(f"wrote {path.name}: {path.stat().st_size / 1024:.0f} KiB")
+    kit.write(__file__, build)

@@ -438,3 +438,11 @@ def save(path: Path) -> None:
         if space.type == "FILE_BROWSER" and space.params:
             space.params.directory = b"//"  # Blender writes the user's home folder here
     bpy.ops.wm.save_as_mainfile(filepath=str(path), compress=True, relative_remap=True)
+
+
+def write(script: str, build: Callable[[], bpy.types.Scene]) -> None:
+    """Build a scene and save it beside its script, as `__file__` names it."""
+    path = Path(script).with_suffix(".blend")
+    build()
+    save(path)
+    print(f"wrote {path.name}: {path.stat().st_size / 1024:.0f} KiB")
