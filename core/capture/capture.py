@@ -3,7 +3,7 @@
 
 import math
 import os
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -82,6 +82,22 @@ class Capture:
         """All (camera name, frame) that have a picture, frame by frame."""
         names = self.camera_names(split)
         return [(name, frame) for frame in range(self.frame_count) for name in names if (name, frame) in self.images]
+
+    def frames(self, start: int, count: int) -> "Capture":
+        """The capture of `count` frames from frame `start` on, counted from 0 again; its times span [0, 1) anew."""
+        if not 0 <= start < start + count <= self.frame_count:
+            raise HoloreelError(
+                f"{self.source}: there are no {count} frames from frame {start} on; it has {self.frame_count}."
+            )
+        kept = range(start, start + count)
+        return replace(
+            self,
+            images={(name, j - start): media for (name, j), media in self.images.items() if j in kept},
+            depths={(name, j - start): path for (name, j), path in self.depths.items() if j in kept},
+            seeds={j - start: path for j, path in self.seeds.items() if j in kept},
+            frame_count=count,
+            frame_start=self.frame_start + start,
+        )
 
     def image(self, name: str, frame: int, background: tuple[float, float, float] | None = None) -> NDArray[np.uint8]:
         """Read one picture: (H, W, 3), or (H, W, 4) with straight alpha where the file has alpha.

@@ -86,6 +86,17 @@ def test_round_trip(tmp_path: Path, capture: Capture) -> None:
     assert read_capture(tmp_path / "again.json").views("train") == capture.views("train")
 
 
+def test_a_run_of_frames_is_a_capture(capture: Capture) -> None:
+    part = capture.frames(1, 2)
+    assert (part.frame_count, part.frame_start, part.times.tolist()) == (2, 6, [0, 0.5])
+    assert part.views("test") == [("middle", 0), ("middle", 1)]
+    assert part.image("right", 1)[1, 2].tolist() == list(pixel(2, 2))
+    assert np.isclose(part.depth("left", 0)[1, 1], 1.1)
+    assert part.seed_points(0).rgb.tolist() == [[201, 1, 2]]
+    with pytest.raises(HoloreelError, match="no 3 frames from frame 1 on; it has 3"):
+        capture.frames(1, 3)
+
+
 def test_nerfstudio_reads_it_as_it_is(tmp_path: Path, capture: Capture) -> None:
     """An independent reader that does what nerfstudio's dataparser does, step by step."""
     meta = json.loads(write_capture(tmp_path, capture).read_text())
