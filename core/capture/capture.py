@@ -38,6 +38,7 @@ class Capture:
     depths: dict[View, Path] = field(default_factory=dict)  # EXR, planar z in scene units
     seeds: dict[int, Path] = field(default_factory=dict)  # PLY of colored points, by frame index
     source: Path = Path("capture")  # the file it was read from, for messages
+    notes: tuple[str, ...] = ()  # what its reader measured or assumed, in sentences
 
     def __post_init__(self) -> None:
         problem = self._problem()
