@@ -4,7 +4,8 @@
 import torch
 from torch import Tensor
 
-from .contract import DensityStats, SpacetimeTensors
+from ..camera import Camera
+from .contract import ACTIVATIONS, DensityStats, SpacetimeTensors
 
 MAX_CHANNELS = 16
 
@@ -50,6 +51,22 @@ def check_images(image: Tensor, target: Tensor) -> None:
     if image.ndim != 3 or image.numel() == 0:
         raise ValueError(f"image has shape {tuple(image.shape)}, not (H, W, C)")
     _check_shapes(target=(target, tuple(image.shape)))
+
+
+def check_decoder(features: Tensor, camera: Camera, hidden: Tensor, output: Tensor, activation: str) -> None:
+    """Raise ValueError unless the arguments of `decode` are as the contract says."""
+    check_pinhole(camera)
+    _check_shapes(
+        features=(features, (camera.height, camera.width, 9)), hidden=(hidden, (6, 12)), output=(output, (3, 6))
+    )
+    if activation not in ACTIVATIONS:
+        raise ValueError(f"activation is {activation!r}, not one of {', '.join(ACTIVATIONS)}")
+
+
+def check_pinhole(camera: Camera) -> None:
+    """Raise ValueError unless the camera's rays are those of a pinhole."""
+    if camera.model != "PINHOLE":
+        raise ValueError(f"the backends draw PINHOLE cameras, not {camera.model}; core.render.view warps for others")
 
 
 def _check_shapes(**expected: tuple[Tensor, tuple[int, ...]]) -> None:

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """What every rasterizer backend promises. Backends: `cpu` (our C++ kernels) and `reference` (plain torch, the oracle).
 
-Each backend module has the two functions `rasterize` and `rasterize_spacetime` with the signatures below; both are
-differentiable with respect to every tensor argument.
+Each backend module has the functions `rasterize`, `rasterize_spacetime` and `decode` with the signatures below; they
+are differentiable with respect to every tensor argument.
 
     rasterize(means, quats, scales, opacities, features, camera, background=None, rules=None, density=None)
         -> Rendering
@@ -11,6 +11,11 @@ differentiable with respect to every tensor argument.
     rasterize_spacetime(gaussians: SpacetimeTensors, time, camera, background=None, rules=None, density=None)
         -> Rendering
         Spacetime Gaussians at `time` (Eqs. 6-9), evaluated and projected in one pass.
+    decode(features, camera, hidden, output, activation) -> Tensor
+        The colors (H,W,3) of a full model's rendering (Eqs. 10-11): features (H,W,9) are [base, direction, time],
+        hidden (6,12) and output (3,6) the weights of the network, activation one of `ACTIVATIONS`. A pixel's color is
+        activation(base + output · relu(hidden · [direction, time, ray origin, ray direction])), with the ray through
+        the pixel's center in the world and its direction of unit length. `clamp` passes no gradient outside [0, 1].
 
 `camera` is a `holoreel.core.camera.Camera` (PINHOLE); `background` a (C,) tensor or None for black; `rules` None for
 `Rules()`. C is 1 to 16.
@@ -25,6 +30,8 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 from torch import Tensor
+
+ACTIVATIONS = ("none", "clamp", "sigmoid")  # of a decoder's output, in the order the kernels number them
 
 
 @dataclass(frozen=True)

@@ -11,12 +11,13 @@ from torch.autograd.function import once_differentiable
 
 from ..camera import Camera
 from ..errors import HoloreelError
-from .checks import check_gaussians, check_images, check_spacetime
-from .contract import DensityStats, Rendering, Rules, SpacetimeTensors
+from .checks import check_decoder, check_gaussians, check_images, check_spacetime
+from .contract import ACTIVATIONS, DensityStats, Rendering, Rules, SpacetimeTensors
 from .native import (
     PARAMETERS,
     TIMINGS,
     CCamera,
+    CDecoder,
     CGaussians,
     CGradients,
     CImageGradients,
@@ -31,6 +32,7 @@ from .native import (
 
 __all__ = [
     "adam_step",
+    "decode",
     "get_threads",
     "l1_dssim",
     "load_kernels",
@@ -83,11 +85,6 @@ class _Job:
     time: float | None
     density: DensityStats | None
 
-    def c_camera(self) -> CCamera:
-        camera = self.camera
-        pose = (ctypes.c_double * 12)(*camera.world_to_camera[:3].ravel().tolist())
-        return CCamera(camera.fx, camera.fy, camera.cx, camera.cy, pose, camera.width, camera.height)
-
     def c_rules(self) -> CRules:
         r = self.rules
         return CRules(
@@ -123,6 +120,11 @@ class _Frame:
         return self.library.holoreel_frame_intersections(self.handle)
 
 
+def _c_camera(camera: Camera) -> CCamera:
+    pose = (ctypes.c_double * 12)(*camera.world_to_camera[:3].ravel().tolist())
+    return CCamera(camera.fx, camera.fy, camera.cx, camera.cy, pose, camera.width, camera.height)
+
+
 def _address(tensor: Tensor | None) -> int | None:
     return None if tensor is None else tensor.data_ptr()
 
@@ -145,7 +147,7 @@ class _Rasterize(torch.autograd.Function):
         rest = torch.empty(height, width)
         images = CImages(*map(_address, (*pictures, rest, background)))
         library = load_kernels()
-        handle = library.holoreel_forward(job.c_gaussians(arrays), job.c_camera(), job.c_rules(), images)
+        handle = library.holoreel_forward(job.c_gaussians(arrays), _c_camera(job.camera), job.c_rules(), images)
         if not handle:
             raise HoloreelError(f"The picture cannot be rendered: {library.holoreel_last_error().decode()}.")
         ctx.frame = _Frame(handle)
@@ -169,7 +171,7 @@ class _Rasterize(torch.autograd.Function):
         status = library.holoreel_backward(
             ctx.frame.handle,
             ctx.job.c_gaussians(tuple(arrays)),
-            ctx.job.c_camera(),
+            _c_camera(ctx.job.camera),
             ctx.job.c_rules(),
             CImages(*map(_address, (features, alpha, depth, rest, background))),
             CImageGradients(*map(_address, incoming)),
@@ -181,6 +183,42 @@ class _Rasterize(torch.autograd.Function):
         if ctx.needs_input_grad[1] and incoming[0] is not None:
             background_gradient = torch.einsum("hwc,hw->c", incoming[0].double(), rest.double()).float()
         return None, background_gradient, *outgoing
+
+
+def decode(features: Tensor, camera: Camera, hidden: Tensor, output: Tensor, activation: str) -> Tensor:
+    """Turn the features of a full model's rendering into colors; shapes and meanings as in `contract`. float32."""
+    check_decoder(features, camera, hidden, output, activation)
+    return _Decode.apply(_plain(features), camera, _plain(hidden), _plain(output), ACTIVATIONS.index(activation))
+
+
+class _Decode(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, features: Tensor, camera: Camera, hidden: Tensor, output: Tensor, activation: int) -> Tensor:
+        image = torch.empty(camera.height, camera.width, 3)
+        decoder = CDecoder(_address(hidden), _address(output), activation, 0)
+        library = load_kernels()
+        if library.holoreel_decode(_c_camera(camera), decoder, _address(features), _address(image)) != 0:
+            raise HoloreelError(f"The picture cannot be decoded: {library.holoreel_last_error().decode()}.")
+        ctx.camera, ctx.activation = camera, activation
+        ctx.save_for_backward(features, hidden, output)
+        return image
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
+        features, hidden, output = ctx.saved_tensors
+        d_features = torch.empty_like(features) if ctx.needs_input_grad[0] else None
+        d_hidden, d_output = torch.empty_like(hidden), torch.empty_like(output)
+        gradient = _plain(gradient)  # keeps it alive during the call
+        library = load_kernels()
+        status = library.holoreel_decode_backward(
+            _c_camera(ctx.camera),
+            CDecoder(_address(hidden), _address(output), ctx.activation, 0),
+            *map(_address, (features, gradient, d_features, d_hidden, d_output)),
+        )
+        if status != 0:
+            raise HoloreelError(f"The gradient cannot be computed: {library.holoreel_last_error().decode()}.")
+        return d_features, None, d_hidden, d_output, None
 
 
 def l1_dssim(image: Tensor, target: Tensor, weight_dssim: float) -> Tensor:

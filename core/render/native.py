@@ -10,7 +10,7 @@ from pathlib import Path
 
 from ..errors import HoloreelError
 
-ABI = 4  # HOLOREEL_ABI in kernels/api.hpp
+ABI = 5  # HOLOREEL_ABI in kernels/api.hpp
 
 
 class CCamera(Structure):
@@ -83,6 +83,12 @@ class CGradients(Structure):
     )
 
 
+class CDecoder(Structure):
+    """`HoloreelDecoder`."""
+
+    _fields_ = (("hidden", c_void_p), ("output", c_void_p), ("activation", c_int32), ("unused", c_int32))
+
+
 TIMINGS = ("project", "sort", "bin", "blend", "backward_blend", "backward_gather")
 
 
@@ -115,6 +121,8 @@ _SIGNATURES = {
         c_int,
         (c_void_p, c_void_p, c_int, c_int, c_int, c_double, POINTER(c_double), c_void_p),
     ),
+    "holoreel_decode": (c_int, (POINTER(CCamera), POINTER(CDecoder), c_void_p, c_void_p)),
+    "holoreel_decode_backward": (c_int, (POINTER(CCamera), POINTER(CDecoder), *[c_void_p] * 5)),
     "holoreel_adam_step": (c_int, (*[c_void_p] * 4, c_int64, *[c_double] * 4, c_int64)),
     "holoreel_frame_free": (None, (c_void_p,)),
     "holoreel_frame_intersections": (c_int64, (c_void_p,)),

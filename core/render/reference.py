@@ -9,12 +9,13 @@ import math
 from collections.abc import Callable, Iterator
 from typing import NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
 from ..camera import Camera
-from .checks import check_gaussians, check_images, check_spacetime
+from .checks import check_decoder, check_gaussians, check_images, check_spacetime
 from .contract import DensityStats, Rendering, Rules, SpacetimeTensors
 
 TILE = 16
@@ -295,6 +296,17 @@ def _watch_density(splats: Splats, camera: Camera, rules: Rules, density: Densit
         density.radius_px[rows] = torch.maximum(density.radius_px[rows], radii)
 
     splats.means.register_hook(add)
+
+
+def decode(features: Tensor, camera: Camera, hidden: Tensor, output: Tensor, activation: str) -> Tensor:
+    """Turn the features of a full model's rendering into colors; shapes and meanings as in `contract`."""
+    check_decoder(features, camera, hidden, output, activation)
+    rays = np.concatenate(camera.rays(), 1).reshape(camera.height, camera.width, 6)
+    inputs = torch.cat((features[..., 3:], torch.tensor(rays, dtype=features.dtype, device=features.device)), 2)
+    colors = features[..., :3] + torch.relu(inputs @ hidden.T) @ output.T
+    if activation == "sigmoid":
+        return torch.sigmoid(colors)
+    return colors.clamp(0, 1) if activation == "clamp" else colors
 
 
 def ssim_map(image: Tensor, target: Tensor) -> Tensor:

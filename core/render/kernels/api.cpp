@@ -10,6 +10,7 @@
 #include <vector>
 
 #include "adam.hpp"
+#include "decode.hpp"
 #include "frame.hpp"
 #include "loss.hpp"
 #include "thread_pool.hpp"
@@ -55,11 +56,15 @@ private:
     Clock::time_point last_ = Clock::now();
 };
 
+void check(const HoloreelCamera& camera) {
+    if (camera.width < 1 || camera.height < 1 || camera.width > 65536 || camera.height > 65536)
+        throw std::invalid_argument("width and height must lie in 1 ... 65536");
+}
+
 void check(const HoloreelGaussians& g, const HoloreelCamera& camera, const HoloreelRules& rules) {
     if (g.count < 0 || g.count > INT32_MAX) throw std::invalid_argument("the number of Gaussians must be under 2^31");
     if (g.channels < 1 || g.channels > kMaxChannels) throw std::invalid_argument("features must have 1 to 16 channels");
-    if (camera.width < 1 || camera.height < 1 || camera.width > 65536 || camera.height > 65536)
-        throw std::invalid_argument("width and height must lie in 1 ... 65536");
+    check(camera);
     if (!(rules.alpha_min >= 1e-6 && rules.alpha_min < rules.alpha_max && rules.alpha_max < 1.0))
         throw std::invalid_argument("alpha_min and alpha_max must obey 1e-6 <= alpha_min < alpha_max < 1");
 }
@@ -234,5 +239,27 @@ HOLOREEL_API int holoreel_adam_step(float* values, const float* gradient, float*
                                     int64_t step) {
     const bool good = guarded(
         [&] { adam_step(values, gradient, mean, mean_square, count, rate, beta1, beta2, epsilon, step); });
+    return good ? 0 : -1;
+}
+
+// Returns 0, or -1 with an error text; `features` (H, W, 9) become `image` (H, W, 3).
+HOLOREEL_API int holoreel_decode(const HoloreelCamera* camera, const HoloreelDecoder* decoder, const float* features,
+                                 float* image) {
+    const bool good = guarded([&] {
+        check(*camera);
+        decode(*camera, *decoder, active_kernels().decode, features, image);
+    });
+    return good ? 0 : -1;
+}
+
+// Returns 0, or -1 with an error text. Overwrites the gradients; that of the features may be null.
+HOLOREEL_API int holoreel_decode_backward(const HoloreelCamera* camera, const HoloreelDecoder* decoder,
+                                          const float* features, const float* image_gradient, float* features_gradient,
+                                          float* hidden_gradient, float* output_gradient) {
+    const bool good = guarded([&] {
+        check(*camera);
+        decode_backward(*camera, *decoder, active_kernels().decode, features, image_gradient, features_gradient,
+                        hidden_gradient, output_gradient);
+    });
     return good ? 0 : -1;
 }

@@ -4,7 +4,7 @@
 
 #include <cstdint>
 
-#define HOLOREEL_ABI 4
+#define HOLOREEL_ABI 5
 #define HOLOREEL_API extern "C" __attribute__((visibility("default")))
 
 struct HoloreelCamera {
@@ -47,6 +47,15 @@ struct HoloreelGradients {
     float* density_gradient;
     int32_t* density_views;
     float* density_radius_px;
+};
+
+// out = base + output relu(hidden [dir, time, ray origin, ray direction]) per pixel of 9 features [base, dir, time], then the
+// activation: 0 none, 1 clamp to [0, 1], 2 sigmoid. `hidden` is (6, 12), `output` (3, 6), row by row; rays are in the world,
+// directions unit vectors through pixel centers.
+struct HoloreelDecoder {
+    const float *hidden, *output;
+    int32_t activation;
+    int32_t unused;
 };
 
 struct HoloreelTimings {  // seconds

@@ -47,10 +47,39 @@ constexpr int kMoments = 6;
 
 using TileKernel = void (*)(const TileJob&, int tile);
 
+// The decoder's sizes: features beside the base color, hidden units, and what a hidden unit looks at (with the ray).
+constexpr int kDecoded = 6, kHidden = 6, kDecoderInputs = kDecoded + 6;
+constexpr int kMaxLanes = 8;
+
+enum class Activation : int32_t { kNone = 0, kClamp = 1, kSigmoid = 2 };
+
+struct DecodeJob {
+    float feature_weights[kHidden][kDecoded], ray_weights[kHidden][3], bias[kHidden], output_weights[3][kHidden];
+    const float* plane_x;  // x / z of each column's rays, with room for a whole vector behind the last
+    double fy, cy;
+    int width;
+    Activation activation;
+    const float *features, *image_gradient;
+    float *image, *features_gradient;  // the second may be null
+};
+
+// Per hidden unit, with d = dL/d(its sum): d times each feature, d times the ray, d, then its output times each channel's
+// gradient.
+struct DecodeSums {
+    static constexpr int kPerHidden = kDecoded + 3 + 1 + 3, kCount = kHidden * kPerHidden;
+    double values[kCount];
+};
+
+struct DecodeKernels {
+    void (*forward)(const DecodeJob&, int row);
+    void (*backward)(const DecodeJob&, int row, DecodeSums&);
+};
+
 struct RasterKernels {
     int lanes;
     TileKernel (*forward)(int padded_channels, bool with_depth);
     TileKernel (*backward)(int padded_channels, bool with_depth);
+    DecodeKernels decode;
 };
 
 // The channel counts the kernels are compiled for; others are padded up.

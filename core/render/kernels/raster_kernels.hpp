@@ -2,6 +2,7 @@
 // The table of one width's kernels. Included once by each width's translation unit.
 #pragma once
 
+#include "decode_row.hpp"
 #include "raster_backward.hpp"
 #include "raster_forward.hpp"
 
@@ -23,7 +24,7 @@ static TileKernel choose_backward(int padded_channels, bool with_depth) { HOLORE
 
 #undef HOLOREEL_EACH_WIDTH
 
-static const RasterKernels kernels = {kLanes, choose_forward, choose_backward};
+static const RasterKernels kernels = {kLanes, choose_forward, choose_backward, {decode_row, decode_row_backward}};
 
 }  // namespace HOLOREEL_NAMESPACE
 }  // namespace holoreel

@@ -31,6 +31,7 @@ HOLOREEL_INLINE F add(F a, F b) { return _mm256_add_ps(a, b); }
 HOLOREEL_INLINE F sub(F a, F b) { return _mm256_sub_ps(a, b); }
 HOLOREEL_INLINE F mul(F a, F b) { return _mm256_mul_ps(a, b); }
 HOLOREEL_INLINE F div(F a, F b) { return _mm256_div_ps(a, b); }
+HOLOREEL_INLINE F sqrt(F a) { return _mm256_sqrt_ps(a); }
 HOLOREEL_INLINE F min(F a, F b) { return _mm256_min_ps(a, b); }
 HOLOREEL_INLINE F max(F a, F b) { return _mm256_max_ps(a, b); }
 HOLOREEL_INLINE F fma(F a, F b, F c) { return _mm256_fmadd_ps(a, b, c); }
@@ -77,6 +78,7 @@ HOLOREEL_INLINE F add(F a, F b) { return _mm_add_ps(a, b); }
 HOLOREEL_INLINE F sub(F a, F b) { return _mm_sub_ps(a, b); }
 HOLOREEL_INLINE F mul(F a, F b) { return _mm_mul_ps(a, b); }
 HOLOREEL_INLINE F div(F a, F b) { return _mm_div_ps(a, b); }
+HOLOREEL_INLINE F sqrt(F a) { return _mm_sqrt_ps(a); }
 HOLOREEL_INLINE F min(F a, F b) { return _mm_min_ps(a, b); }
 HOLOREEL_INLINE F max(F a, F b) { return _mm_max_ps(a, b); }
 HOLOREEL_INLINE F fma(F a, F b, F c) { return _mm_add_ps(_mm_mul_ps(a, b), c); }
@@ -120,6 +122,7 @@ HOLOREEL_INLINE F add(F a, F b) { return vaddq_f32(a, b); }
 HOLOREEL_INLINE F sub(F a, F b) { return vsubq_f32(a, b); }
 HOLOREEL_INLINE F mul(F a, F b) { return vmulq_f32(a, b); }
 HOLOREEL_INLINE F div(F a, F b) { return vdivq_f32(a, b); }
+HOLOREEL_INLINE F sqrt(F a) { return vsqrtq_f32(a); }
 HOLOREEL_INLINE F min(F a, F b) { return vminq_f32(a, b); }
 HOLOREEL_INLINE F max(F a, F b) { return vmaxq_f32(a, b); }
 HOLOREEL_INLINE F fma(F a, F b, F c) { return vfmaq_f32(c, a, b); }
@@ -159,6 +162,10 @@ HOLOREEL_INLINE F add(F a, F b) { return a + b; }
 HOLOREEL_INLINE F sub(F a, F b) { return a - b; }
 HOLOREEL_INLINE F mul(F a, F b) { return a * b; }
 HOLOREEL_INLINE F div(F a, F b) { return a / b; }
+HOLOREEL_INLINE F sqrt(F a) {
+    for (int k = 0; k < 4; k++) a[k] = __builtin_sqrtf(a[k]);
+    return a;
+}
 HOLOREEL_INLINE F fma(F a, F b, F c) { return a * b + c; }
 HOLOREEL_INLINE F fnma(F a, F b, F c) { return c - a * b; }
 HOLOREEL_INLINE F negate(F a) { return -a; }
