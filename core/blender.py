@@ -7,28 +7,21 @@ child has its own process group and ends when this process does; what it prints 
 """
 
 import importlib.util
-import json
 import os
 import shutil
-import signal
-import subprocess
 import sys
-from collections import deque
 from collections.abc import Callable, Iterable
-from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
 
+from .child import run_child
 from .errors import HoloreelError
 
 ENVIRONMENT_VARIABLE = "HOLOREEL_BLENDER"
-MARKER = "@holoreel "  # begins a line of the child that is an event, as JSON
 
 _ROOT = Path(__file__).resolve().parents[1]  # the folder that is the package `holoreel`
 _CHECKOUT_ENVIRONMENTS = (".venv-bpy52", ".venv-bpy45")
-_LOG_TAIL = 50
-_PATIENCE_SECONDS = 5
 
 # The package is loaded from its folder under its own name, whatever that folder is called, and whether or not Blender's
 # Python knows it.
@@ -110,97 +103,15 @@ def run_in_blender(
     """
     log = Path(log)
     try:
-        log.parent.mkdir(parents=True, exist_ok=True)
-        with open(log, "w", encoding="utf-8") as log_file, _start(blender, inherit) as child:
-            try:
-                outcome = _converse(child, {"function": function, "job": job}, log_file, on_event)
-                with suppress(subprocess.TimeoutExpired):  # it said all it had to say, and hangs at exit
-                    child.wait(_PATIENCE_SECONDS)
-            finally:
-                _kill(child)
+        ending = run_child(
+            blender.command(_BOOTSTRAP.format(root=str(_ROOT))),
+            log=log,
+            request={"function": function, "job": job},
+            on_event=on_event,
+            inherit=inherit,
+        )
     except OSError as error:
         raise HoloreelError(
             f"Blender at {blender.path} cannot be run, or {log} not be written ({error.strerror or error})."
         ) from error
-    if outcome is None:
-        raise HoloreelError(_obituary(blender, child.returncode, log))
-    if outcome["event"] == "error":
-        where = "" if outcome.get("mendable") else f"; all it said is in {log}"
-        raise HoloreelError(f"{outcome['message']}{where}")
-    return outcome.get("result")
-
-
-def _start(blender: Blender, inherit: Iterable[int]) -> subprocess.Popen[str]:
-    environment = {key: value for key, value in os.environ.items() if key not in ("PYTHONPATH", "PYTHONHOME")}
-    return subprocess.Popen(
-        blender.command(_BOOTSTRAP.format(root=str(_ROOT))),
-        stdin=subprocess.PIPE,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.STDOUT,
-        text=True,
-        encoding="utf-8",
-        errors="replace",
-        env=environment | {"PYTHONIOENCODING": "utf-8", "PYTHONUNBUFFERED": "1"},
-        start_new_session=True,
-        pass_fds=tuple(inherit) if os.name != "nt" else (),
-    )
-
-
-def _converse(
-    child: subprocess.Popen[str],
-    request: dict[str, Any],
-    log: IO[str],
-    on_event: Callable[[dict[str, Any]], None] | None,
-) -> dict[str, Any] | None:
-    """Send the request, pass events on until the child is done; return its last word, None where it died without one.
-
-    The child's standard input stays open: its end tells the child that this process is gone.
-    """
-    assert child.stdin is not None
-    assert child.stdout is not None
-    try:
-        child.stdin.write(json.dumps(request) + "\n")
-        child.stdin.flush()
-    except BrokenPipeError:  # it died at once; what it printed says why
-        with suppress(BrokenPipeError):
-            child.stdin.close()
-    for line in child.stdout:
-        event = _event(line)
-        if event is None:
-            if line.strip():
-                log.write(line)
-                log.flush()
-        elif event["event"] in ("done", "error"):
-            return event
-        elif on_event:
-            on_event(event)
-    return None
-
-
-def _event(line: str) -> dict[str, Any] | None:
-    """The event in a line of the child; None where it is talk for the log."""
-    if not line.startswith(MARKER):
-        return None
-    try:
-        event = json.loads(line.removeprefix(MARKER))
-    except ValueError:  # somebody else's words ran into ours
-        return None
-    return event if isinstance(event, dict) and "event" in event else None
-
-
-def _kill(child: subprocess.Popen[str]) -> None:
-    """End the child and all it started."""
-    if hasattr(os, "killpg"):
-        with suppress(ProcessLookupError):
-            os.killpg(child.pid, signal.SIGKILL)
-    else:
-        child.kill()
-    child.wait()
-
-
-def _obituary(blender: Blender, status: int, log: Path) -> str:
-    with open(log, encoding="utf-8") as file:
-        lines = deque((line.strip() for line in file if line.strip()), maxlen=_LOG_TAIL)
-    last = next((line for line in reversed(lines) if "Error" in line or "error" in line), lines[-1] if lines else "")
-    how = f"was ended by {signal.Signals(-status).name}" if status < 0 else f"stopped with status {status}"
-    return f"Blender at {blender.path} {how}, last saying '{last[:200]}'; all it said is in {log}."
+    return ending.result(f"Blender at {blender.path}")

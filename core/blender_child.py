@@ -5,11 +5,10 @@ import importlib
 import json
 import os
 import sys
-import threading
 import traceback
-from typing import Any, NoReturn
+from typing import NoReturn
 
-from .blender import MARKER
+from .child import emit, end_with_parent
 from .errors import HoloreelError
 
 
@@ -20,7 +19,7 @@ def serve() -> NoReturn:
     whoever asked is gone.
     """
     request = json.loads(sys.stdin.readline())
-    threading.Thread(target=_end_with_parent, daemon=True).start()
+    end_with_parent()
     module, _, name = request["function"].partition(":")
     try:
         result = getattr(importlib.import_module(module), name)(request["job"], emit)
@@ -36,14 +35,3 @@ def serve() -> NoReturn:
         emit({"event": "error", "message": text, "mendable": False})
     sys.stderr.flush()
     os._exit(0)
-
-
-def emit(event: dict[str, Any]) -> None:
-    """Send one event; it has a line of its own whatever was printed before it."""
-    sys.stdout.write(f"\n{MARKER}{json.dumps(event)}\n")
-    sys.stdout.flush()
-
-
-def _end_with_parent() -> None:
-    sys.stdin.read()
-    os._exit(1)
