@@ -11,7 +11,7 @@ from torch.autograd.function import once_differentiable
 
 from ..camera import Camera
 from ..errors import HoloreelError
-from .checks import check_decoder, check_gaussians, check_images, check_spacetime
+from .checks import check_decoder, check_gaussians, check_images, check_pinhole, check_spacetime
 from .contract import ACTIVATIONS, DensityStats, Rendering, Rules, SpacetimeTensors
 from .native import (
     PARAMETERS,
@@ -56,6 +56,7 @@ def rasterize(
 ) -> Rendering:
     """Render 3D Gaussians; shapes and meanings as in `contract`. Everything is computed in float32 on the CPU."""
     rules = rules or Rules()
+    check_pinhole(camera)
     check_gaussians(means, quats, scales, opacities, features, background, density)
     job = _Job(camera, rules, None, density)
     arrays = (means, None, quats, None, scales, opacities, features, None, None)
@@ -72,6 +73,7 @@ def rasterize_spacetime(
 ) -> Rendering:
     """Render Spacetime Gaussians at `time`; shapes and meanings as in `contract`. float32 on the CPU."""
     rules = rules or Rules()
+    check_pinhole(camera)
     check_spacetime(gaussians, background, density)
     return _render(_Job(camera, rules, float(time), density), background, tuple(gaussians))
 

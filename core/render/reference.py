@@ -15,7 +15,7 @@ from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
 from ..camera import Camera
-from .checks import check_decoder, check_gaussians, check_images, check_spacetime
+from .checks import check_decoder, check_gaussians, check_images, check_pinhole, check_spacetime
 from .contract import DensityStats, Rendering, Rules, SpacetimeTensors
 
 TILE = 16
@@ -60,6 +60,7 @@ def rasterize(
 ) -> Rendering:
     """Render 3D Gaussians; shapes and meanings as in `contract`."""
     rules = rules or Rules()
+    check_pinhole(camera)
     check_gaussians(means, quats, scales, opacities, features, background, density)
     with torch.no_grad():
         rows = torch.nonzero(_finite(means, quats, scales, features) & (opacities >= rules.alpha_min))[:, 0]
@@ -77,6 +78,7 @@ def rasterize_spacetime(
 ) -> Rendering:
     """Render Spacetime Gaussians at `time`; shapes and meanings as in `contract`."""
     rules = rules or Rules()
+    check_pinhole(camera)
     check_spacetime(gaussians, background, density)
     g = gaussians
     with torch.no_grad():
@@ -140,13 +142,14 @@ def project(g: Gaussians3D, rows: Tensor, camera: Camera, rules: Rules) -> Splat
 
     x, y, z = (g.means @ turn.T + shift).unbind(1)
     tan_x, tan_y = x / z, y / z
-    limit_x = rules.jacobian_clamp * 0.5 * camera.width / abs(camera.fx)
-    limit_y = rules.jacobian_clamp * 0.5 * camera.height / abs(camera.fy)
+    margin = 0.5 * (rules.jacobian_clamp - 1)
+    limits_x = [(edge * camera.width - camera.cx) / camera.fx for edge in (-margin, 1 + margin)]
+    limits_y = [(edge * camera.height - camera.cy) / camera.fy for edge in (-margin, 1 + margin)]
     zero = torch.zeros_like(z)
     jacobian = torch.stack(
         (
-            *(camera.fx / z, zero, -camera.fx * tan_x.clamp(-limit_x, limit_x) / z),
-            *(zero, camera.fy / z, -camera.fy * tan_y.clamp(-limit_y, limit_y) / z),
+            *(camera.fx / z, zero, -camera.fx * tan_x.clamp(*limits_x) / z),
+            *(zero, camera.fy / z, -camera.fy * tan_y.clamp(*limits_y) / z),
         ),
         1,
     ).reshape(-1, 2, 3)

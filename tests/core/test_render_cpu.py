@@ -3,6 +3,8 @@
 
 import functools
 import math
+from dataclasses import replace
+from types import SimpleNamespace
 from typing import NamedTuple
 
 import numpy as np
@@ -50,7 +52,7 @@ class Case(NamedTuple):
     rules: Rules
 
 
-def hard_case(channels, count=1500, width=123, height=85, seed=1):
+def hard_case(channels, count=1500, width=123, height=85, seed=4):
     """All kinds of Gaussians that are trouble, among ordinary ones. 123 x 85 is no multiple of a tile."""
     g, camera = random_scene(count, width, height, channels, median_radius_px=7, seed=seed)
     kind = iter(range(0, count, 40))
@@ -192,6 +194,36 @@ def test_hard_scene_agrees_with_the_oracle(lanes, channels):
 
 def test_full_size_scene_agrees_with_the_oracle(lanes):
     assert_agrees(plain_case, 3, 20_000, 640, 360, threads_tried=(2,))
+
+
+def off_center_case(shift):
+    """The hard case with the principal point far from the middle, or outside the picture; Gaussians fill the picture."""
+    case = hard_case(3)
+    camera = replace(case.camera, cx=case.camera.cx + shift * 123, cy=case.camera.cy - 0.7 * shift * 85)
+    means = case.gaussians.means.clone()
+    means[:, 0] -= shift * 123 / camera.fx * means[:, 2]
+    means[:, 1] += 0.7 * shift * 85 / camera.fy * means[:, 2]
+    return case._replace(camera=camera, gaussians=case.gaussians._replace(means=means))
+
+
+@pytest.mark.parametrize("shift", [0.45, -0.65])
+def test_principal_point_far_from_the_middle(lanes, shift):
+    assert_agrees(off_center_case, shift, threads_tried=(2,))
+
+
+@pytest.mark.parametrize("backend", [cpu, reference], ids=["cpu", "reference"])
+@pytest.mark.parametrize(("left", "top"), [(0, 0), (96, 64), (32, 64)])
+def test_a_crop_is_a_camera_with_another_principal_point(backend, left, top):
+    """Also under the Jacobian's clamp, which lies around the crop's own borders: small Gaussians do not reach it."""
+    gaussians, camera = random_scene(1500, 160, 120, 3, median_radius_px=4, seed=8)
+    gaussians.log_scales.clamp_(max=math.log(2 / camera.fx))  # and those farther than a pixel or two are small
+    gaussians.motions.zero_()
+    whole = backend.rasterize_spacetime(gaussians, TIME, camera)
+    crop = replace(camera, width=64, height=56, cx=camera.cx - left, cy=camera.cy - top)
+    part = backend.rasterize_spacetime(gaussians, TIME, crop)
+    assert part.alpha.max() > 0.9
+    for ours, theirs in zip(part, whole, strict=True):
+        torch.testing.assert_close(ours, theirs[top : top + 56, left : left + 64], rtol=1e-4, atol=1e-5)
 
 
 @pytest.mark.parametrize("channels", [2, 5, 12, 16])
@@ -358,6 +390,9 @@ def test_wrong_shapes_are_named():
         cpu.rasterize_spacetime(case.gaussians._replace(features=torch.zeros(100, 17)), TIME, case.camera)
     with pytest.raises(ValueError, match="background has shape"):
         cpu.rasterize_spacetime(case.gaussians, TIME, case.camera, torch.zeros(4))
+    for backend in (cpu, reference):
+        with pytest.raises(ValueError, match="PINHOLE cameras, not OTHER"):
+            backend.rasterize_spacetime(case.gaussians, TIME, SimpleNamespace(model="OTHER"))
     with pytest.raises(HoloreelError, match="alpha_min"):
         cpu.rasterize_spacetime(case.gaussians, TIME, case.camera, rules=Rules(alpha_min=0.0))
 

@@ -2,6 +2,7 @@
 """The oracle is not judged by itself: against a plain loop over Gaussians, and against finite differences."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -38,9 +39,8 @@ def loop_render(g, time, camera, background, rules):
         cross = np.array([[0, -c, b], [c, 0, -a], [-b, a, 0]])
         rotation = np.eye(3) + 2 * w * cross + 2 * cross @ cross
         covariance = rotation @ np.diag(np.exp(2 * g.log_scales[i])) @ rotation.T
-        limit_x = rules.jacobian_clamp * camera.width / camera.fx / 2
-        limit_y = rules.jacobian_clamp * camera.height / camera.fy / 2
-        tangent_x, tangent_y = np.clip(x / z, -limit_x, limit_x), np.clip(y / z, -limit_y, limit_y)
+        tangent_x = np.clip(x / z, *tangent_limits(rules, camera.width, camera.fx, camera.cx))
+        tangent_y = np.clip(y / z, *tangent_limits(rules, camera.height, camera.fy, camera.cy))
         jacobian = np.array([[camera.fx, 0, -camera.fx * tangent_x], [0, camera.fy, -camera.fy * tangent_y]]) / z
         jacobian = jacobian @ pose[:3, :3]
         conic = np.linalg.inv(jacobian @ covariance @ jacobian.T + rules.low_pass * np.eye(2))
@@ -58,6 +58,12 @@ def loop_render(g, time, camera, background, rules):
     return picture + transmittance[..., None] * background, alpha, depth
 
 
+def tangent_limits(rules, pixels, focal, principal):
+    """Return the tangents at the picture's two borders, moved outwards by what the clamp adds to half a field of view."""
+    more = (rules.jacobian_clamp - 1) * 0.5 * pixels / focal
+    return -principal / focal - more, (pixels - principal) / focal + more
+
+
 def turned_camera(camera: Camera) -> Camera:
     """The same picture size from another place, with an uncentered principal point and oblong pixels."""
     angle = 0.3
@@ -67,8 +73,8 @@ def turned_camera(camera: Camera) -> Camera:
     return Camera(camera.width, camera.height, camera.fx, 1.1 * camera.fy, camera.cx + 3.3, camera.cy - 2.7, pose)
 
 
-@pytest.mark.parametrize("channels", [1, 3])
-def test_reference_matches_a_plain_loop(channels):
+@pytest.mark.parametrize(("channels", "shift"), [(1, 0.0), (3, 0.0), (3, 0.45), (2, -0.7)])
+def test_reference_matches_a_plain_loop(channels, shift):
     gaussians, camera = random_scene(400, 53, 37, channels, median_radius_px=9, seed=3)
     gaussians.opacity_logits[:80] = 7.0  # saturated
     gaussians.log_scales[80:90] += 3.0
@@ -77,6 +83,7 @@ def test_reference_matches_a_plain_loop(channels):
     gaussians.trbf_log_scales[110:130] = -4.0
     gaussians.means[130:150, 2] *= -1
     camera = turned_camera(camera)
+    camera = replace(camera, cx=camera.cx + shift * camera.width, cy=camera.cy - 0.5 * shift * camera.height)
     background = np.linspace(0.2, 0.9, channels)
     rules = Rules(near=1.5)
     doubles = SpacetimeTensors(*(array.double() for array in gaussians))

@@ -11,7 +11,7 @@ namespace holoreel {
 struct View {
     double fx, fy, cx, cy;
     double rotation[9], translation[3];
-    double limit_x, limit_y;  // of x/z and y/z in the Jacobian
+    double min_x, max_x, min_y, max_y;  // of x/z and y/z in the Jacobian
     double width, height;
 
     View(const HoloreelCamera& camera, const HoloreelRules& rules);
@@ -33,7 +33,7 @@ struct SplatGradient {
 
 constexpr double kMinQuatNorm = 1e-12;  // under this a quaternion means no rotation
 
-inline double clamp(double x, double limit) { return x < -limit ? -limit : x > limit ? limit : x; }
+inline double clamp(double x, double low, double high) { return x < low ? low : x > high ? high : x; }
 
 struct Rotation {
     double w, x, y, z, norm;  // normalized
@@ -93,8 +93,8 @@ inline void build(const Instant& g, const View& view, Chain& c) {
     const double* V = view.rotation;
     const double iz = 1.0 / c.cam[2];
     const double tx = c.cam[0] * iz, ty = c.cam[1] * iz;
-    c.tan_x = clamp(tx, view.limit_x);
-    c.tan_y = clamp(ty, view.limit_y);
+    c.tan_x = clamp(tx, view.min_x, view.max_x);
+    c.tan_y = clamp(ty, view.min_y, view.max_y);
     c.inside_x = c.tan_x == tx;
     c.inside_y = c.tan_y == ty;
     c.j00 = view.fx * iz;
@@ -119,8 +119,11 @@ inline View::View(const HoloreelCamera& camera, const HoloreelRules& rules)
         for (int k = 0; k < 3; k++) rotation[3 * r + k] = camera.world_to_camera[4 * r + k];
         translation[r] = camera.world_to_camera[4 * r + 3];
     }
-    limit_x = rules.jacobian_clamp * 0.5 * width / std::fabs(fx);
-    limit_y = rules.jacobian_clamp * 0.5 * height / std::fabs(fy);
+    const double margin = 0.5 * (rules.jacobian_clamp - 1.0);
+    min_x = (-margin * width - cx) / fx;
+    max_x = ((1.0 + margin) * width - cx) / fx;
+    min_y = (-margin * height - cy) / fy;
+    max_y = ((1.0 + margin) * height - cy) / fy;
 }
 
 // False where the Gaussian is nearer than `near`, or its covariance cannot be inverted or is not finite.
