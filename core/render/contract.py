@@ -41,10 +41,9 @@ class Rules:
     A pixel skips a Gaussian whose alpha is under `alpha_min`, caps alpha at `alpha_max`, and stops before the Gaussian
     that would take its transmittance under `transmittance_min`. `low_pass` (px²) is added to the diagonal of the 2D
     covariance. Gaussians nearer than `near` are skipped. Where the Jacobian is taken, and there alone, `x/z` and `y/z`
-    are held within the picture and a margin on each of its four sides, wherever the principal point lies:
-    (jacobian_clamp - 1) / 2 of the width or height, so that `jacobian_clamp` is how much wider than the picture that is.
-    `detach_motion_time` makes `trbf_centers` learn from the opacity alone, as the authors train: by default it also gets
-    the gradient through motion and rotation.
+    are held within the picture and a margin on each of its four sides, wherever the principal point lies: the margin is
+    (jacobian_clamp - 1) / 2 of the width or height. `detach_motion_time` makes `trbf_centers` learn from the opacity
+    alone, as the authors train: by default it also gets the gradient through motion and rotation.
     """
 
     alpha_max: float = 0.99

@@ -197,7 +197,7 @@ def test_full_size_scene_agrees_with_the_oracle(lanes):
 
 
 def off_center_case(shift):
-    """The hard case with the principal point far from the middle, or outside the picture; Gaussians fill the picture."""
+    """The hard case with the principal point far from the middle; the Gaussians are moved to fill the picture."""
     case = hard_case(3)
     camera = replace(case.camera, cx=case.camera.cx + shift * 123, cy=case.camera.cy - 0.7 * shift * 85)
     means = case.gaussians.means.clone()

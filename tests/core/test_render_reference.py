@@ -59,7 +59,7 @@ def loop_render(g, time, camera, background, rules):
 
 
 def tangent_limits(rules, pixels, focal, principal):
-    """Return the tangents at the picture's two borders, moved outwards by what the clamp adds to half a field of view."""
+    """Return the tangents at the picture's two borders, moved out by what the clamp adds to half the field of view."""
     more = (rules.jacobian_clamp - 1) * 0.5 * pixels / focal
     return -principal / focal - more, (pixels - principal) / focal + more
 
