@@ -136,19 +136,27 @@ HOLOREEL_HEAVY_CLONES void project_chunk(const HoloreelGaussians& g, const View&
     overflow.clear();
     const int64_t begin = chunk * kChunk, end = std::min(begin + kChunk, frame.count);
     visible = slots = 0;
-    for (int64_t i = begin; i < end; i++) {
-        Footprint& footprint = frame.footprints[i];
-        footprint.tiles = 0;
+    for (int64_t first = begin; first < end; first += kRows) {
+        const RowRange rows{first, static_cast<int>(std::min<int64_t>(kRows, end - first))};
+        for (int lane = 0; lane < rows.count; lane++) frame.footprints[first + lane].tiles = 0;
         Instant instant;
-        Splat splat;
-        if (!evaluate(g, i, rules, instant) || !project(instant, view, rules, splat)) continue;
-        const double log_opacity = std::log(instant.opacity);
-        const Ellipse ellipse(splat, 2.0 * (log_opacity - log_alpha_min));
-        lay_out(splat, ellipse, frame, footprint, overflow);
-        if (footprint.tiles == 0) continue;
-        write_record(g, i, log_opacity, splat, ellipse, frame, frame.records.data() + i * stride);
-        keys[begin + visible++] = depth_key(splat.depth, i);
-        slots += footprint.tiles;
+        Splats splats;
+        Mask seen = evaluate(g, rows, rules, instant);
+        if (!any(seen)) continue;
+        seen &= project(instant, view, rules, splats);
+        for (int lane = 0; lane < rows.count; lane++) {
+            if (!seen[lane]) continue;
+            const int64_t i = first + lane;
+            Footprint& footprint = frame.footprints[i];
+            const Splat splat = splat_at(splats, lane);
+            const double log_opacity = std::log(instant.opacity[lane]);
+            const Ellipse ellipse(splat, 2.0 * (log_opacity - log_alpha_min));
+            lay_out(splat, ellipse, frame, footprint, overflow);
+            if (footprint.tiles == 0) continue;
+            write_record(g, i, log_opacity, splat, ellipse, frame, frame.records.data() + i * stride);
+            keys[begin + visible++] = depth_key(splat.depth, i);
+            slots += footprint.tiles;
+        }
     }
 }
 

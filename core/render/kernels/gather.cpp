@@ -32,58 +32,85 @@ void clear_row(const HoloreelGradients& out, int64_t i, int channels) {
 }
 
 // From the tile sums to the splat: with f = -|w|²/2 and w = W d, df/dmean = Wᵀw and df/dcov = ½ Wᵀ w wᵀ W.
-SplatGradient splat_gradient(const Splat& s, const double* sums) {
+SplatGradient splat_gradient(const Splats& s, const D* sums) {
     constexpr double unscale = 1.1774100225154747;  // sqrt(2 / log2(e)): the tiles' u, v are W d times sqrt(log2(e) / 2)
-    const double u = sums[1] * unscale, v = sums[2] * unscale;
-    const double uu = sums[3] * 2.0 / kLog2E, uv = sums[4] * 2.0 / kLog2E, vv = sums[5] * 2.0 / kLog2E;
+    const D u = sums[1] * unscale, v = sums[2] * unscale;
+    const D uu = sums[3] * (2.0 / kLog2E), uv = sums[4] * (2.0 / kLog2E), vv = sums[5] * (2.0 / kLog2E);
     SplatGradient d;
     d.x = s.w11 * u;
     d.y = s.w12 * u + s.w22 * v;
     d.cov_xx = 0.5 * s.w11 * s.w11 * uu;
     d.cov_xy = 0.5 * s.w11 * (s.w12 * uu + s.w22 * uv);
     d.cov_yy = 0.5 * (s.w12 * s.w12 * uu + 2.0 * s.w12 * s.w22 * uv + s.w22 * s.w22 * vv);
-    d.depth = 0.0;
     return d;
 }
 
-void update_density(const HoloreelGradients& out, int64_t i, const Splat& s, const SplatGradient& d) {
-    if (out.density_gradient) out.density_gradient[i] += static_cast<float>(std::hypot(d.x, d.y));
-    if (out.density_views) out.density_views[i]++;
-    if (out.density_radius_px) {
-        const double middle = 0.5 * (s.cov_xx + s.cov_yy), half = 0.5 * (s.cov_xx - s.cov_yy);
-        const double longest = middle + std::sqrt(half * half + s.cov_xy * s.cov_xy);
-        out.density_radius_px[i] = std::max(out.density_radius_px[i], static_cast<float>(3.0 * std::sqrt(longest)));
+void update_density(const HoloreelGradients& out, const RowRange& rows, Mask wanted, const Splats& s,
+                    const SplatGradient& d) {
+    const D pull = sqrt(d.x * d.x + d.y * d.y);
+    const D middle = 0.5 * (s.cov_xx + s.cov_yy), half = 0.5 * (s.cov_xx - s.cov_yy);
+    const D radius = 3.0 * sqrt(middle + sqrt(half * half + s.cov_xy * s.cov_xy));
+    for (int lane = 0; lane < rows.count; lane++) {
+        if (!wanted[lane]) continue;
+        const int64_t i = rows.first + lane;
+        if (out.density_gradient) out.density_gradient[i] += static_cast<float>(pull[lane]);
+        if (out.density_views) out.density_views[i]++;
+        if (out.density_radius_px)
+            out.density_radius_px[i] = std::max(out.density_radius_px[i], static_cast<float>(radius[lane]));
     }
+}
+
+// Adds up what the tiles of one Gaussian left, in their order.
+template <int kWidth>
+void sum_tiles(const float* place, uint32_t tiles, int width, double* total) {
+    const int count = kWidth ? kWidth : width;
+    for (uint32_t tile = 0; tile < tiles; tile++, place += count)
+        for (int k = 0; k < count; k++) total[k] += place[k];
 }
 
 HOLOREEL_HEAVY_CLONES void gather_chunk(const HoloreelGaussians& g, const View& view, const HoloreelRules& rules,
                                         int64_t chunk, const Frame& frame, const float* sums, bool with_depth,
                                         const HoloreelGradients& out) {
     const int padded = frame.padded_channels, width = kMoments + padded + (with_depth ? 1 : 0);
+    const bool density = out.density_gradient || out.density_views || out.density_radius_px;
     const int64_t end = std::min((chunk + 1) * kChunk, frame.count);
-    for (int64_t i = chunk * kChunk; i < end; i++) {
-        const Footprint& footprint = frame.footprints[i];
-        Instant instant;
-        Splat splat;
-        // The second test always holds for what the forward pass saw, unless the arrays were changed in between.
-        if (!footprint.tiles || !evaluate(g, i, rules, instant) || !project(instant, view, rules, splat)) {
-            clear_row(out, i, frame.channels);
-            continue;
+    for (int64_t first = chunk * kChunk; first < end; first += kRows) {
+        const RowRange rows{first, static_cast<int>(std::min<int64_t>(kRows, end - first))};
+        Mask seen{};
+        for (int lane = 0; lane < rows.count; lane++) seen[lane] = frame.footprints[first + lane].tiles ? -1 : 0;
+        Instant instant{};
+        Splats splats{};
+        // These hold for what the forward pass saw, unless the arrays were changed in between.
+        if (any(seen)) seen &= evaluate(g, rows, rules, instant);
+        if (any(seen)) seen &= project(instant, view, rules, splats);
+        D moments[kMoments], d_depth = all(0.0);
+        for (int lane = 0; lane < rows.count; lane++) {
+            const int64_t i = first + lane;
+            if (!seen[lane]) {
+                clear_row(out, i, frame.channels);
+                continue;
+            }
+            double total[kMoments + kMaxChannels + 1] = {};
+            const Footprint& footprint = frame.footprints[i];
+            const float* place = sums + static_cast<int64_t>(footprint.slot) * width;
+            if (width == kMoments + 3)
+                sum_tiles<kMoments + 3>(place, footprint.tiles, width, total);
+            else
+                sum_tiles<0>(place, footprint.tiles, width, total);
+            for (int k = 0; k < kMoments; k++) moments[k][lane] = total[k];
+            if (with_depth) d_depth[lane] = total[kMoments + padded];
+            if (out.features)
+                for (int c = 0; c < frame.channels; c++)
+                    out.features[i * frame.channels + c] = static_cast<float>(total[kMoments + c]);
         }
-        double total[kMoments + kMaxChannels + 1] = {};
-        const float* place = sums + static_cast<int64_t>(footprint.slot) * width;
-        for (uint32_t tile = 0; tile < footprint.tiles; tile++, place += width)
-            for (int k = 0; k < width; k++) total[k] += place[k];
-        SplatGradient d_splat = splat_gradient(splat, total);
-        if (with_depth) d_splat.depth = total[kMoments + padded];
+        if (!any(seen)) continue;
+        SplatGradient d_splat = splat_gradient(splats, moments);
+        d_splat.depth = d_depth;
         InstantGradient d_instant;
         project_backward(instant, view, d_splat, d_instant);
-        d_instant.opacity = total[0] / instant.opacity;
-        evaluate_backward(g, i, rules, instant, d_instant, out);
-        if (out.features)
-            for (int c = 0; c < frame.channels; c++)
-                out.features[i * frame.channels + c] = static_cast<float>(total[kMoments + c]);
-        update_density(out, i, splat, d_splat);
+        d_instant.opacity = moments[0] / instant.opacity;
+        evaluate_backward(g, rows, rules, instant, d_instant, seen, out);
+        if (density) update_density(out, rows, seen, splats, d_splat);
     }
 }
 

@@ -12,7 +12,7 @@
 
 // For work in double precision on one Gaussian after another, with everything it calls put inside (GCC only).
 #if defined(__x86_64__) && defined(__gnu_linux__) && !defined(__clang__)
-#define HOLOREEL_HEAVY_CLONES __attribute__((target_clones("arch=haswell", "default"), flatten))
+#define HOLOREEL_HEAVY_CLONES __attribute__((target_clones("arch=x86-64-v3", "default"), flatten))
 #else
 #define HOLOREEL_HEAVY_CLONES
 #endif
