@@ -6,7 +6,6 @@ extrinsics are world-to-camera. Other conventions are converted where files are 
 """
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -16,39 +15,22 @@ from numpy.typing import ArrayLike, NDArray
 
 from .errors import HoloreelError
 from .files import finite, read_json, write_json
+from .lens import MODELS
 
 Array = NDArray[np.float64]
 
 MAX_SIZE = 1 << 16  # pixels along one side
 MAX_COORDINATE = 1e15  # of a camera's place
+MAX_DISTORTION = 1e6  # of one distortion parameter
 RIGID_TOLERANCE = 1e-3  # largest entry of RᵀR − 1 that still counts as rounding
-
-
-@dataclass(frozen=True)
-class LensModel:
-    """How one of COLMAP's camera models maps camera space to the plane z = 1 (before fx, fy, cx, cy) and back."""
-
-    to_plane: Callable[["Camera", Array], Array]  # points (N, 3) -> (N, 2)
-    from_plane: Callable[["Camera", Array], Array]  # (N, 2) -> directions (N, 3) with z = 1
-
-
-def _pinhole_to_plane(_camera: "Camera", points: Array) -> Array:
-    with np.errstate(divide="ignore", invalid="ignore"):
-        return points[:, :2] / points[:, 2:]
-
-
-def _pinhole_from_plane(_camera: "Camera", plane: Array) -> Array:
-    return np.concatenate([plane, np.ones((len(plane), 1))], axis=1)
-
-
-MODELS: dict[str, LensModel] = {"PINHOLE": LensModel(_pinhole_to_plane, _pinhole_from_plane)}
 
 
 @dataclass(frozen=True, eq=False)
 class Camera:
     """One calibrated camera.
 
-    `fx fy cx cy` are in pixels; `world_to_camera` is 4 × 4 with an orthonormal rotation; `model` is COLMAP's name.
+    `fx fy cx cy` are in pixels; `world_to_camera` is 4 × 4 with an orthonormal rotation; `model` is COLMAP's name and
+    `distortion` its parameters beyond those four, in COLMAP's order (`holoreel.core.lens`): none for PINHOLE.
     Raises `HoloreelError` naming a field that is not possible. A rotation that is off by rounding is made orthonormal.
     """
 
@@ -61,6 +43,7 @@ class Camera:
     world_to_camera: Array = field(default_factory=lambda: np.eye(4))
     model: str = "PINHOLE"
     name: str = ""
+    distortion: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
         set_field = object.__setattr__  # the dataclass is frozen for everybody else
@@ -70,6 +53,7 @@ class Camera:
             raise self._error(
                 "model", f"{_short(self.model)} is not supported; undistort it to one of {', '.join(MODELS)}"
             )
+        set_field(self, "distortion", self._distortion())
         for key in ("width", "height"):
             set_field(self, key, self._size(key))
         for key in ("fx", "fy", "cx", "cy"):
@@ -92,6 +76,16 @@ class Camera:
         if value != int(value) or not 1 <= value <= MAX_SIZE:
             raise self._error(key, f"must be a whole number of pixels from 1 to {MAX_SIZE}, not {value:g}")
         return int(value)
+
+    def _distortion(self) -> tuple[float, ...]:
+        names = MODELS[self.model].parameters
+        given = self.distortion
+        values = [finite(value) for value in given] if isinstance(given, list | tuple | np.ndarray) else [None]
+        numbers = tuple(value for value in values if value is not None and abs(value) <= MAX_DISTORTION)
+        if len(values) != len(names) or len(numbers) != len(names):
+            wanted = f"{len(names)} numbers ({', '.join(names)}) up to {MAX_DISTORTION:g}" if names else "empty"
+            raise self._error("distortion", f"of a {self.model} camera must be {wanted}, not {_short(given)}")
+        return numbers
 
     def _rigid(self) -> Array:
         try:
@@ -119,21 +113,28 @@ class Camera:
     def project(self, points: ArrayLike) -> tuple[Array, Array]:
         """Project world points (N, 3) to pixels (N, 2) and depths (N,), the z of camera space.
 
-        A point is in front of the camera where z > 0; pixels of others mean nothing.
+        A point is in front of the camera where z > 0; pixels of others mean nothing for a PINHOLE. Pixels are NaN for
+        points that a lens with distortion cannot see.
         """
         local = np.asarray(points, np.float64) @ self.world_to_camera[:3, :3].T + self.world_to_camera[:3, 3]
-        plane = MODELS[self.model].to_plane(self, local)
+        plane = MODELS[self.model].to_plane(self.distortion, local)
         return plane * (self.fx, self.fy) + (self.cx, self.cy), local[:, 2]
 
     def unproject(self, uv: ArrayLike, z: ArrayLike) -> Array:
-        """Return the world points (N, 3) at pixels `uv` (N, 2) and planar depths `z` (N,)."""
-        local = self._directions(uv) * np.asarray(z, np.float64)[:, None]
+        """Return the world points (N, 3) at pixels `uv` (N, 2) and planar depths `z` (N,).
+
+        NaN where the lens sees nothing at a pixel, or nothing in front of the camera (a fisheye beyond 90°).
+        """
+        directions = self._directions(uv)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            along = np.where(directions[:, 2] > 0, np.asarray(z, np.float64) / directions[:, 2], np.nan)
+        local = directions * along[:, None]
         return self._to_world(local) + self.center
 
     def rays(self, pixels: ArrayLike | None = None) -> tuple[Array, Array]:
         """Return world-space origins (N, 3) and unit directions (N, 3) through `pixels` (N, 2).
 
-        Without `pixels`: through the centers of all pixels, row by row.
+        Without `pixels`: through the centers of all pixels, row by row. Directions are NaN where the lens sees nothing.
         """
         directions = self._to_world(self._directions(self.pixel_centers() if pixels is None else pixels))
         directions /= np.linalg.norm(directions, axis=1, keepdims=True)
@@ -146,10 +147,15 @@ class Camera:
 
     def _directions(self, uv: ArrayLike) -> Array:
         plane = (np.asarray(uv, np.float64) - (self.cx, self.cy)) / (self.fx, self.fy)
-        return MODELS[self.model].from_plane(self, plane)
+        return MODELS[self.model].from_plane(self.distortion, plane)
 
     def _to_world(self, directions: Array) -> Array:
         return directions @ self.world_to_camera[:3, :3]
+
+    def require_pinhole(self, what: str) -> None:
+        """Raise `HoloreelError` unless the camera is a PINHOLE, the only lens that `what` knows."""
+        if self.model != "PINHOLE":
+            raise self._error("model", f"is {self.model}, but {what} knows PINHOLE alone; undistort the pictures first")
 
     def scaled(self, width: int, height: int) -> "Camera":
         """The same camera with another resolution: it sees the same, in `width` × `height` pixels."""
@@ -190,9 +196,11 @@ class Camera:
         return cls(width, height, fx, fx if fy is None else fy, width / 2, height / 2, matrix, name=name)
 
     def to_json(self) -> dict[str, Any]:
-        """Return what CAMERA.json holds; `world_to_camera` as 4 rows."""
+        """Return what CAMERA.json holds: `world_to_camera` as 4 rows, `distortion` where the model has any."""
         keys = ("model", "width", "height", "fx", "fy", "cx", "cy")
         value = {key: getattr(self, key) for key in keys}
+        if self.distortion:
+            value["distortion"] = list(self.distortion)
         value["world_to_camera"] = self.world_to_camera.tolist()
         return value | ({"name": self.name} if self.name else {})
 
@@ -201,6 +209,8 @@ class Camera:
         """Make a camera from `to_json`'s dictionary; errors begin with `source`."""
         needed = {"model", "width", "height", "fx", "fy", "cx", "cy", "world_to_camera"}
         model = value.get("model")
+        if isinstance(model, str) and model in MODELS and MODELS[model].parameters:
+            needed.add("distortion")
         if isinstance(model, str) and model not in MODELS:
             raise HoloreelError(f"{source}: model {model!r} is not supported; undistort it to {', '.join(MODELS)}.")
         if missing := sorted(needed - set(value)):
@@ -256,7 +266,10 @@ def invert_rigid(matrix: Array) -> Array:
 
 
 def read_camera(path: str | Path) -> Camera:
-    """Read a CAMERA.json (keys model, width, height, fx, fy, cx, cy, world_to_camera as 4 rows, name optional)."""
+    """Read a CAMERA.json (keys model, width, height, fx, fy, cx, cy, world_to_camera as 4 rows, name optional).
+
+    A camera whose model is not PINHOLE also has `distortion`, a list of its parameters in COLMAP's order.
+    """
     return Camera.from_json(read_json(path), path)
 
 

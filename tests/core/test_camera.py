@@ -131,7 +131,7 @@ def test_small_rounding_is_mended_and_matrix_is_read_only() -> None:
     [
         ("width", 0), ("width", -1), ("width", 2.5), ("width", 10**9), ("height", math.nan), ("height", "8"),
         ("fx", 0), ("fx", -3), ("fx", math.inf), ("fy", math.nan), ("fy", None), ("cx", math.nan), ("cy", "a"),
-        ("cx", True), ("model", "FULL_OPENCV"), ("model", None), ("world_to_camera", np.eye(3)),
+        ("cx", True), ("model", "THIN_PRISM"), ("model", None), ("world_to_camera", np.eye(3)),
         ("world_to_camera", np.diag([2, 2, 2, 1])), ("world_to_camera", np.diag([1, 1, -1, 1])),
         ("world_to_camera", np.full((4, 4), math.nan)), ("world_to_camera", "abc"), ("world_to_camera", [[1], [1, 2]]),
         ("world_to_camera", np.zeros((4, 4))), ("world_to_camera", np.ones((4, 4))),
@@ -159,7 +159,7 @@ def test_camera_file(tmp_path: Path) -> None:
     assert np.array_equal(read_camera(path).world_to_camera, camera.world_to_camera)
     good = json.loads(path.read_text())
     for change, field in [
-        ({"model": "OPENCV"}, "model"), ({"fx": -1}, "fx"), ({"k1": 0.1}, "k1"), ({"world_to_camera": [[1]]}, "world"),
+        ({"model": "FOV"}, "model"), ({"model": "OPENCV"}, "distortion is missing"), ({"fx": -1}, "fx"), ({"k1": 0.1}, "k1"), ({"world_to_camera": [[1]]}, "world"),
     ]:  # fmt: skip
         path.write_text(json.dumps(good | change))
         with pytest.raises(HoloreelError, match=rf"CAMERA\.json.*{field}"):
