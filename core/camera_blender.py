@@ -78,10 +78,7 @@ class BlenderCamera:
 
         The fit is horizontal; where `sensor_width` would need a lens under Blender's 1 mm, the sensor grows instead.
         """
-        if camera.model != "PINHOLE":
-            raise HoloreelError(
-                f"camera {camera.name!r}: Blender has no lens for the model {camera.model}; undistort it."
-            )
+        camera.require_pinhole("Blender")
         lens = camera.fx * sensor_width / camera.width
         if lens < _MIN_LENS:
             lens, sensor_width = _MIN_LENS, sensor_width * _MIN_LENS / lens

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
-from numpy.polynomial import polynomial
+from numpy.polynomial import Polynomial, polynomial
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
@@ -60,32 +60,19 @@ def brown_limit(k: Parameters) -> float:
     p = |(p1, p2)| adds no less than -6 r p and -2 r p; off the diagonal are no more than 2 r p. Gershgorin's circles
     stay positive where f' > 8 r p and g > 4 r p.
     """
-    top, bottom = _brown_polynomials(k)
-    s, p = np.array([0.0, 1.0]), np.array([0.0, math.hypot(k[2], k[3])])
-    slope = polynomial.polymul(polynomial.polyadd(top, 2 * polynomial.polymul(s, polynomial.polyder(top))), bottom)
-    slope = polynomial.polysub(
-        slope, 2 * polynomial.polymul(s, polynomial.polymul(top, polynomial.polyder(bottom)))
-    )  # of f', times bottom²
-    slope = polynomial.polysub(
-        _in_radius(slope), 8 * polynomial.polymul(p, _in_radius(polynomial.polymul(bottom, bottom)))
-    )
-    size = polynomial.polysub(_in_radius(top), 4 * polynomial.polymul(p, _in_radius(bottom)))
-    return min(_first_root(slope), _first_root(size), _first_root(_in_radius(bottom)))
+    r = Polynomial([0.0, 1.0])
+    top, bottom = (Polynomial(coefficients)(r * r) for coefficients in _brown_polynomials(k))
+    p = math.hypot(k[2], k[3])
+    slope = (r * top).deriv() * bottom - r * top * bottom.deriv() - 8 * p * r * bottom * bottom
+    return min(_first_root(slope), _first_root(top - 4 * p * r * bottom), _first_root(bottom))
 
 
-def _in_radius(in_square: Array) -> Array:
-    """A polynomial in s = r², as one in r."""
-    result = np.zeros(2 * len(in_square) - 1)
-    result[::2] = in_square
-    return result
-
-
-def _first_root(ascending: Array) -> float:
+def _first_root(one_at_zero: Polynomial) -> float:
     """The smallest positive root of a polynomial that is 1 at 0; infinity where it has none.
 
     Roots are sought for 1/x, whose polynomial has the leading coefficient 1, however small the others are.
     """
-    roots = np.roots(ascending)
+    roots = np.roots(one_at_zero.coef)
     real = roots.real[(np.abs(roots.imag) <= 1e-7 * np.abs(roots)) & (roots.real > 1e-12)]
     return float(1 / real.max()) if len(real) else math.inf
 
@@ -174,7 +161,8 @@ def _brown_step(k: Parameters, plane: Array, found: Array, limit: float) -> Arra
 @lru_cache(maxsize=1024)
 def fisheye_limit(k: Parameters) -> float:
     """The angle from the axis, in radians and at most π, up to which θ' grows."""
-    return min(math.pi, _first_root(_in_radius(np.array([1.0, *((2 * i + 3) * c for i, c in enumerate(k))]))))
+    theta = Polynomial([0.0, 1.0])
+    return min(math.pi, _first_root((theta * Polynomial([1.0, *k])(theta * theta)).deriv()))
 
 
 def _fisheye(k: Parameters, theta: Array) -> tuple[Array, Array]:
