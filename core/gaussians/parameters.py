@@ -8,24 +8,47 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..render.contract import SpacetimeTensors
+from ..render.contract import DensityStats, SpacetimeTensors
 from .model import SpacetimeGaussians
+from .scale import Measure
 
 BETAS = (0.9, 0.999)
 EPSILON = 1e-15  # gradients of a mean loss over a picture are tiny; the usual 1e-8 would damp the step
+DECODER = {"hidden": (6, 12), "output": (3, 6)}  # the tensors of a full model's network
+ROW_STATE = ("gradient", "views", "radius_px")  # of density control
+
+
+def _ones(means: Tensor) -> Tensor:
+    return torch.ones(len(means))
+
+
+def empty_stats(count: int) -> DensityStats:
+    """Make the accumulators that a backward pass fills."""
+    return DensityStats(torch.zeros(count), torch.zeros(count, dtype=torch.int32), torch.zeros(count))
 
 
 class Parameters:
-    """Spacetime Gaussians as leaf tensors, and Adam's two moments for each of them."""
+    """Spacetime Gaussians as leaf tensors, a full model's network, and Adam's two moments for each of them.
 
-    def __init__(self, gaussians: SpacetimeGaussians):
+    `measure` gives the unit of length at each mean, in which steps of positions and motions are counted; `units` (N,)
+    are the ones in use, `stats` what density control gathers: rows of both come and go with the Gaussians.
+    """
+
+    def __init__(
+        self, gaussians: SpacetimeGaussians, network: Mapping[str, Tensor] | None = None, measure: Measure = _ones
+    ):
         self.tensors = {
             name: torch.from_numpy(np.ascontiguousarray(getattr(gaussians, name), np.float32)).requires_grad_()
             for name in SpacetimeTensors._fields
         }
-        self.first = {name: torch.zeros_like(value) for name, value in self.tensors.items()}
-        self.second = {name: torch.zeros_like(value) for name, value in self.tensors.items()}
+        self.network = {name: value.detach().clone().requires_grad_() for name, value in (network or {}).items()}
+        everything = {**self.tensors, **self.network}
+        self.first = {name: torch.zeros_like(value) for name, value in everything.items()}
+        self.second = {name: torch.zeros_like(value) for name, value in everything.items()}
         self.steps = 0
+        self.measure = measure
+        self.units = measure(self.tensors["means"].detach())
+        self.stats = empty_stats(len(self))
 
     def __len__(self) -> int:
         return len(self.tensors["means"])
@@ -39,16 +62,29 @@ class Parameters:
         """Copy the values out."""
         return SpacetimeGaussians(**{name: value.detach().numpy().copy() for name, value in self.tensors.items()})
 
-    def step(self, rates: Mapping[str, float], backend: ModuleType) -> None:
-        """Take one Adam step with a learning rate per tensor, and clear the gradients."""
+    def step(self, rates: Mapping[str, float | Tensor], backend: ModuleType) -> None:
+        """Take one Adam step with a learning rate per tensor, and clear the gradients.
+
+        A rate may be a tensor that is broadcast against the parameter. What has the rate 0 stays as it is.
+        """
         self.steps += 1
         with torch.no_grad():
-            for name, value in self.tensors.items():
-                if value.grad is not None:
-                    backend.adam_step(
-                        value, value.grad, self.first[name], self.second[name], rates[name], *BETAS, EPSILON, self.steps
-                    )
-                    value.grad = None
+            for name, value in (*self.tensors.items(), *self.network.items()):
+                rate, gradient = rates[name], value.grad
+                value.grad = None
+                if gradient is None or (isinstance(rate, float) and rate == 0.0):
+                    continue
+                moments = (self.first[name], self.second[name])
+                if isinstance(rate, Tensor):  # the step in units of the rate, which then scales it
+                    step = torch.zeros_like(value)
+                    backend.adam_step(step, gradient, *moments, 1.0, *BETAS, EPSILON, self.steps)
+                    value.addcmul_(step, rate)
+                else:
+                    backend.adam_step(value, gradient, *moments, rate, *BETAS, EPSILON, self.steps)
+
+    def refresh_units(self) -> None:
+        """Measure the unit of length again where the Gaussians are now."""
+        self.units = self.measure(self.tensors["means"].detach())
 
     def keep(self, rows: Tensor) -> None:
         """Keep only these rows (bool or index), moments included."""
@@ -56,6 +92,8 @@ class Parameters:
             self.tensors[name] = value.detach()[rows].clone().requires_grad_()
             self.first[name] = self.first[name][rows].clone()
             self.second[name] = self.second[name][rows].clone()
+        self.units = self.units[rows].clone()
+        self.stats = DensityStats(*(getattr(self.stats, name)[rows].clone() for name in ROW_STATE))
 
     def append(self, rows: Mapping[str, Tensor]) -> None:
         """Add rows with zero moments."""
@@ -64,6 +102,16 @@ class Parameters:
             self.tensors[name] = torch.cat([value.detach(), new]).requires_grad_()
             self.first[name] = torch.cat([self.first[name], torch.zeros_like(new)])
             self.second[name] = torch.cat([self.second[name], torch.zeros_like(new)])
+        self.units = torch.cat([self.units, self.measure(rows["means"])])
+        stats = [getattr(self.stats, name) for name in ROW_STATE]
+        added = len(rows["means"])
+        self.stats = DensityStats(*(torch.cat([value, value.new_zeros(added)]) for value in stats))
+
+    def forget(self, rows: Tensor) -> None:
+        """Set the moments of these rows (bool or index) to zero."""
+        for name in self.tensors:
+            self.first[name][rows] = 0
+            self.second[name][rows] = 0
 
     def rows(self, rows: Tensor) -> dict[str, Tensor]:
         """Copy some rows out."""
@@ -71,15 +119,26 @@ class Parameters:
 
     def state(self) -> dict[str, object]:
         """Everything `load_state` needs to go on bit for bit."""
-        detached = {name: value.detach() for name, value in self.tensors.items()}
-        return {"tensors": detached, "first": self.first, "second": self.second, "steps": self.steps}
+        return {
+            "tensors": {name: value.detach() for name, value in self.tensors.items()},
+            "network": {name: value.detach() for name, value in self.network.items()},
+            "first": self.first,
+            "second": self.second,
+            "steps": self.steps,
+            "units": self.units,
+            "stats": {name: getattr(self.stats, name) for name in ROW_STATE},
+        }
 
     @classmethod
-    def from_state(cls, state: Mapping) -> "Parameters":
+    def from_state(cls, state: Mapping, measure: Measure = _ones) -> "Parameters":
         """Rebuild from `state`."""
         self = cls.__new__(cls)
         self.tensors = {name: value.clone().requires_grad_() for name, value in state["tensors"].items()}
+        self.network = {name: value.clone().requires_grad_() for name, value in state["network"].items()}
         self.first = {name: value.clone() for name, value in state["first"].items()}
         self.second = {name: value.clone() for name, value in state["second"].items()}
         self.steps = int(state["steps"])
+        self.measure = measure
+        self.units = state["units"].clone()
+        self.stats = DensityStats(*(state["stats"][name].clone() for name in ROW_STATE))
         return self

@@ -2,17 +2,20 @@
 """The first Gaussians of a run, from the capture's points of all frames (Spacetime Gaussians, Sec. 5)."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..capture import Points
 from .config import TrainConfig
-from .model import SpacetimeGaussians
+from .model import ALWAYS_LOG_SCALE, SpacetimeGaussians, logit
 
 # A voxel this many point spacings wide almost surely holds a point of every frame in which its surface is there.
 STATIC_VOXEL = 2.5
 STATIC_SHARE = 0.8
+SIZE_LIMITS = (0.1, 10.0)  # of a seed, in point spacings
+SIGMOID_COLORS = (0.02, 0.98)  # a sigmoid reaches neither 0 nor 1
 
 
 def neighbor_distances(points: NDArray[np.float32], count: int = 3) -> NDArray[np.float32]:
@@ -46,7 +49,24 @@ def split_static(
     """Return which points lie where nearly all frames have points: what stands still, (N,)."""
     voxels = voxel_ids(points, STATIC_VOXEL * spacing)
     occupied = np.unique(voxels * frame_count + frames) // frame_count
-    return np.bincount(occupied, minlength=voxels.max() + 1)[voxels] >= STATIC_SHARE * frame_count
+    needed = STATIC_SHARE * len(np.unique(frames))  # not every frame need have points
+    return np.bincount(occupied, minlength=voxels.max() + 1)[voxels] >= needed
+
+
+def chosen_points(points: Sequence[Points], config: TrainConfig) -> NDArray[np.bool_]:
+    """Return which of the points of all frames may become seeds, (N,) in the order of the frames.
+
+    Every `seed_frames`-th frame takes part; all but the first one with the `sparse_share` of its points that are
+    farthest from their neighbors: what the first frame leaves open, and no copies of what it shows.
+    """
+    chosen = []
+    for index, frame in enumerate(points):
+        keep = np.full(len(frame), index % config.seed_frames == 0)
+        if index and config.sparse_share < 1.0 and keep.any():
+            distances = neighbor_distances(frame.xyz, 1)
+            keep[np.argsort(-distances, kind="stable")[round(config.sparse_share * len(frame)) :]] = False
+        chosen.append(keep)
+    return np.concatenate(chosen)
 
 
 def gaussians_from_points(
@@ -54,8 +74,9 @@ def gaussians_from_points(
 ) -> SpacetimeGaussians:
     """Make lite Spacetime Gaussians from the points of each frame of a segment.
 
-    Points that nearly every frame has in the same place become one long-lived Gaussian; the others become short-lived
-    ones centered at their frame. Sizes follow the distance to the nearest neighbors. There must be a point.
+    With `split_static`, points that nearly every frame has in the same place become one long-lived Gaussian; the others
+    (without, all) become Gaussians of `moving_width` centered at their frame. Sizes follow the distance to the nearest
+    neighbors. There must be a point.
     """
     frame_count = len(points)
     xyz = np.concatenate([frame.xyz for frame in points])
@@ -63,20 +84,20 @@ def gaussians_from_points(
     frames = np.repeat(np.arange(frame_count), [len(frame) for frame in points])
     spacing = _surface_spacing(max(points, key=len).xyz, rng)
 
-    static = split_static(xyz, frames, frame_count, spacing) if frame_count > 1 else np.ones(len(xyz), dtype=bool)
+    static = np.ones(len(xyz), dtype=bool)
+    if not config.split_static:
+        static[:] = False
+    elif frame_count > 1:
+        static = split_static(xyz, frames, frame_count, spacing)
     order = rng.permutation(len(xyz))
+    order = order[chosen_points(points, config)[order]]
     kept = _thin(xyz, order[static[order]], spacing, config.max_seeds * 2 // 3)
     moving = order[~static[order]]
     kept = np.concatenate([kept, moving[: max(config.max_seeds - len(kept), 0)]])
 
     xyz, rgb, frames, static = xyz[kept], rgb[kept], frames[kept], static[kept]
-    scales = np.empty(len(kept), np.float32)
-    scales[static] = neighbor_distances(xyz[static]) if static.any() else 0
-    # Neighbors of a moving point are those of its own frame: the others are where it was, not how dense it is.
-    for frame in np.unique(frames[~static]):
-        rows = ~static & (frames == frame)
-        scales[rows] = neighbor_distances(xyz[rows])
-    scales = np.clip(scales, 0.1 * spacing, 10.0 * spacing)
+    scales = _sizes(xyz, frames, static, config.split_static)
+    scales = np.clip(scales, SIZE_LIMITS[0] * spacing, SIZE_LIMITS[1] * spacing)
     count = len(kept)
     return SpacetimeGaussians(
         means=xyz,
@@ -88,6 +109,43 @@ def gaussians_from_points(
         features=rgb,
         trbf_centers=np.where(static, 0.5, frames / frame_count).astype(np.float32),
         trbf_log_scales=np.log(np.where(static, config.static_width, config.moving_width)).astype(np.float32),
+    )
+
+
+def _sizes(
+    xyz: NDArray[np.float32], frames: NDArray[np.int64], static: NDArray[np.bool_], by_frame: bool
+) -> NDArray[np.float32]:
+    """Return the root mean square distance of each point to its nearest neighbors, (N,)."""
+    if not by_frame:
+        return neighbor_distances(xyz)
+    scales = np.empty(len(xyz), np.float32)
+    scales[static] = neighbor_distances(xyz[static]) if static.any() else 0
+    # Neighbors of a moving point are those of its own frame: the others are where it was, not how dense it is.
+    for frame in np.unique(frames[~static]):
+        rows = ~static & (frames == frame)
+        scales[rows] = neighbor_distances(xyz[rows])
+    return scales
+
+
+def as_trained(gaussians: SpacetimeGaussians, config: TrainConfig) -> SpacetimeGaussians:
+    """Return Gaussians as the run trains them: features of its model, and neutral where it leaves a part out.
+
+    The color of a lite one becomes the base of a full one, before the decoder's output function.
+    """
+    features, motions = gaussians.features, gaussians.motions.copy()
+    if config.model == "full" and gaussians.variant == "lite":
+        base = features
+        if config.decoder_output == "sigmoid":
+            base = logit(np.clip(features, *SIGMOID_COLORS))
+        features = np.concatenate([base, np.zeros((len(gaussians), 6))], axis=1)
+    motions[:, config.motion :] = 0.0
+    widths = gaussians.trbf_log_scales
+    return replace(
+        gaussians,
+        features=features,
+        motions=motions,
+        omegas=gaussians.omegas if config.rotation else np.zeros_like(gaussians.omegas),
+        trbf_log_scales=widths if config.temporal_opacity else np.full_like(widths, ALWAYS_LOG_SCALE),
     )
 
 

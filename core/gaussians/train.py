@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Training of Spacetime Gaussians from a capture (Spacetime Gaussians, Sec. 4.3)."""
+"""Training of Spacetime Gaussians from a capture (Spacetime Gaussians, Sec. 4)."""
 
 import math
 import signal
 import threading
 import time
-from collections import OrderedDict
+from collections import Counter, OrderedDict
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
@@ -15,15 +15,23 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ..camera import Camera
 from ..capture import Capture, View
 from ..errors import HoloreelError
+from ..render.contract import Rendering, Rules
 from .config import TrainConfig
-from .density import SceneScale, densify, empty_stats, prune, reset_opacities
+from .density import SETTINGS, DensityControl
+from .guided import Patches, Stability, depth_range, measure_patches, new_gaussians, sample_rays, worst_patches
+from .mcmc import McmcControl
 from .model import SpacetimeGaussians
-from .parameters import Parameters
-from .seeds import gaussians_from_points
+from .parameters import DECODER, Parameters
+from .scale import measure_scene
+from .seeds import as_trained, gaussians_from_points
 
-CACHE_BYTES = 2 << 30
+GUIDED_VIEWS = 24  # pictures that guided sampling looks at, or as many as there are cameras
+STABLE_PART = 0.02  # of a run over which the loss is averaged to see whether it is stable
+FEWEST_PART = 0.01  # of the largest number of Gaussians: with fewer, a scene has been pruned to nothing
+SEED_PIXELS = (0.3, 60.0)  # smallest and largest standard deviation of a seed
 
 
 @dataclass(frozen=True)
@@ -38,15 +46,23 @@ class Progress:
     seconds_left: float
 
 
-class PictureCache:
-    """Pictures of a capture as (H, W, 3) uint8, read when first asked for; the least recently used make room."""
+class PictureQueue:
+    """Pictures of a capture in a random order, each once before any comes again; the least recently used make room."""
 
-    def __init__(self, capture: Capture, background: tuple[float, float, float], limit: int = CACHE_BYTES):
-        self.capture, self.background, self.limit, self.bytes = capture, background, limit, 0
+    def __init__(
+        self, capture: Capture, views: list[View], background: tuple[float, float, float], seed: int, limit_bytes: int
+    ):
+        self.capture, self.views, self.background, self.limit = capture, views, background, limit_bytes
+        self.rng = torch.Generator().manual_seed(seed)
+        self.queue: list[int] = []
+        self.bytes = 0
         self.pictures: OrderedDict[View, np.ndarray] = OrderedDict()
 
-    def get(self, view: View) -> Tensor:
-        """Return one picture in display-referred [0, 1], (H, W, 3) float32, over the background."""
+    def next(self) -> tuple[View, np.ndarray]:
+        """Return a view and its picture, (H, W, 3) uint8 over the background."""
+        if not self.queue:
+            self.queue = torch.randperm(len(self.views), generator=self.rng).tolist()
+        view = self.views[self.queue.pop()]
         if view in self.pictures:
             self.pictures.move_to_end(view)
         else:
@@ -54,7 +70,16 @@ class PictureCache:
             self.bytes += self.pictures[view].nbytes
             while self.bytes > self.limit and len(self.pictures) > 1:
                 self.bytes -= self.pictures.popitem(last=False)[1].nbytes
-        return torch.from_numpy(self.pictures[view]).to(torch.float32).mul_(1.0 / 255.0)
+        return view, self.pictures[view]
+
+    def state(self) -> dict[str, object]:
+        """Where the sequence is."""
+        return {"rng": self.rng.get_state(), "queue": list(self.queue)}
+
+    def load_state(self, state: Mapping) -> None:
+        """Go on where `state` was taken."""
+        self.rng.set_state(state["rng"])
+        self.queue = list(state["queue"])
 
 
 @contextmanager
@@ -87,29 +112,22 @@ def _interrupts_between_steps() -> Iterator[Callable[[], None]]:
         signal.signal(signal.SIGINT, before)
 
 
-def measure_scene(capture: Capture, points: np.ndarray) -> SceneScale:
-    """Measure what one pixel covers at the seeds' median depth, and how near the seeds come to the training cameras."""
-    footprints, nearest = [], math.inf
-    cameras = [capture.cameras[name] for name in capture.camera_names("train")]
-    for camera in cameras:
-        uv, depth = camera.project(points)
-        seen = (depth > 0) & (uv >= 0).all(axis=1) & (uv < (camera.width, camera.height)).all(axis=1)
-        if seen.any():
-            footprints.append(np.median(depth[seen]) / camera.fx)
-            nearest = min(nearest, float(np.quantile(depth[seen], 0.001)))
-    if not footprints:
-        raise HoloreelError(
-            f"{capture.source}: no training camera sees any of the capture's seed points; "
-            "check that points and cameras share one world."
-        )
-    centers = torch.tensor(np.stack([camera.center for camera in cameras]), dtype=torch.float32)
-    return SceneScale(float(np.median(footprints)), nearest, centers)
-
-
 class Trainer:
-    """One run: from the capture's seed points to trained Gaussians, resumable at any iteration."""
+    """One run: from a capture's seed points, or given Gaussians, to trained ones; resumable at any iteration.
 
-    def __init__(self, capture: Capture, config: TrainConfig, backend: ModuleType):
+    `seeds` are lite or full Gaussians to begin with instead of those made of the capture's points; for full ones,
+    `network` may be the decoder weights they were trained with (`hidden`, `output`).
+    Raises `HoloreelError` where there is nothing to learn from or to begin with.
+    """
+
+    def __init__(
+        self,
+        capture: Capture,
+        config: TrainConfig,
+        backend: ModuleType,
+        seeds: SpacetimeGaussians | None = None,
+        network: Mapping[str, np.ndarray] | None = None,
+    ):
         self.capture, self.config, self.backend = capture, config, backend
         self.views = capture.views("train")
         if not self.views:
@@ -117,28 +135,55 @@ class Trainer:
                 f"{capture.source}: no camera of the training split has a picture; hold fewer cameras out."
             )
         points = [capture.seed_points(frame) for frame in range(capture.frame_count)]
-        if not sum(len(frame.xyz) for frame in points):
+        xyz = np.concatenate([frame.xyz for frame in points]) if seeds is None else seeds.means
+        if not len(xyz):
             raise HoloreelError(
-                f"{capture.source}: the capture has no seed points (ply_file_path in transforms.json); "
-                "synthesize it with --seed-points or add a point cloud."
+                f"{capture.source}: the capture has no seed points; make them of its pictures with `holoreel sfm`, or "
+                "synthesize it with --seed-points."
             )
-        self.scene = measure_scene(capture, np.concatenate([frame.xyz for frame in points]))
+        self.scene = measure_scene(capture, xyz)
+        self.measure = self.scene.footprints if config.unit == "footprint" else self.scene.extents
         self.times = torch.tensor(capture.times, dtype=torch.float32)
         self.background = torch.tensor(config.background)
+        # What is too near to a camera to stay must not be too near to be seen.
+        near = 0.5 * config.density.prune_depth * self.scene.nearest or Rules.near
+        self.rules = Rules(near=min(Rules.near, near), detach_motion_time=config.detach_time)
         self.rng = torch.Generator().manual_seed(config.seed)
-        seeds = gaussians_from_points(points, config, np.random.default_rng(config.seed))
-        self.parameters = Parameters(seeds)
-        self.stats = empty_stats(len(self.parameters))
-        self.pictures = PictureCache(capture, config.background)
-        self.queue: list[int] = []
+        if seeds is None:
+            seeds = self._fitted(gaussians_from_points(points, config, np.random.default_rng(config.seed)))
+        self.parameters = Parameters(as_trained(seeds, config), self._network(network), self.measure)
+        self.pictures = PictureQueue(capture, self.views, config.background, config.seed, config.picture_memory)
+        control = DensityControl if config.strategy == "density" else McmcControl
+        self.control: DensityControl | McmcControl = control(config, self.scene, self.times)
         self.iteration = 0
         self.seconds = 0.0
         self.history: list[tuple[int, float, float, int]] = []
-        first, last = config.density.start * config.iterations, config.density.stop * config.iterations
-        self.densify_at = (
-            {round(at) for at in np.linspace(first, last, config.density.events)} if config.density.events else set()
-        )
-        self.reset_at = {round(part * config.iterations) for part in config.density.reset_at}
+        self.most = len(self.parameters)
+        self.lost: Counter[str] = Counter()
+        self.stability = Stability(round(STABLE_PART * config.planned), config.guided.stable)
+        self.guided_at: list[int] = []
+
+    def _fitted(self, seeds: SpacetimeGaussians) -> SpacetimeGaussians:
+        """Keep seeds from being specks or fog where neighbors are no measure of their size."""
+        footprints = self.scene.footprints(torch.from_numpy(seeds.means)).numpy()[:, None]
+        low, high = (np.log(pixels * footprints) for pixels in SEED_PIXELS)
+        seeds.log_scales = np.clip(seeds.log_scales, low, high).astype(np.float32)
+        return seeds
+
+    def _network(self, given: Mapping[str, np.ndarray] | None) -> dict[str, Tensor]:
+        """Return the first weights of a full model's network: what it adds to the base color is zero."""
+        if self.config.model == "lite":
+            return {}
+        if given is not None:
+            return {name: torch.tensor(np.asarray(given[name], np.float32)) for name in DECODER}
+        bound = 1.0 / math.sqrt(DECODER["hidden"][1])
+        hidden = (2.0 * torch.rand(DECODER["hidden"], generator=self.rng) - 1.0) * bound
+        hidden[:, 6:9] *= self._origin_scale()
+        return {"hidden": hidden, "output": torch.zeros(DECODER["output"])}
+
+    def _origin_scale(self) -> float:
+        """Return what makes ray origins, the network's one input in world units, comparable with the others."""
+        return 1.0 / max(float(self.scene.centers.norm(dim=1).max()), self.scene.nearest * 1e-3)
 
     def run(self, on_progress: Callable[[Progress], None], until: int | None = None, every: int = 20) -> None:
         """Train up to iteration `until` (default: to the end), reporting every few iterations.
@@ -173,62 +218,134 @@ class Trainer:
             check_interrupt()
 
     def step(self) -> tuple[float, float]:
-        """Look at one picture and learn from it; return the loss and the mean squared error."""
-        view = self._next_view()
-        camera, target = self.capture.cameras[view[0]], self.pictures.get(view)
-        rendering = self.backend.rasterize_spacetime(
-            self.parameters.spacetime, self.capture.time(view[1]), camera, self.background, density=self.stats
-        )
-        loss = self.backend.l1_dssim(rendering.features, target, self.config.dssim_weight)
-        loss.backward()
+        """Look at one picture (a batch of them) and learn from it; return the loss and the mean squared error."""
+        loss = mse = 0.0
+        width = 0
+        for _ in range(self.config.batch):
+            view, picture = self.pictures.next()
+            one_loss, one_mse = self._learn(view, picture)
+            loss, mse = loss + one_loss / self.config.batch, mse + one_mse / self.config.batch
+            width = max(width, self.capture.cameras[view[0]].width)
+        self.control.before_step(self.parameters)
         self.parameters.step(self._rates(), self.backend)
-        if self.config.clamp_colors:
+        if self.config.clamp_colors and self.config.model == "lite":
             with torch.no_grad():
                 self.parameters.tensors["features"].clamp_(0.0, 1.0)
         self.iteration += 1
-        mse = float((rendering.features.detach() - target).square().mean())
-        self._control_density(camera.width)
-        return float(loss.detach()), mse
+        with torch.no_grad():
+            self._control_number(loss, 0.5 * width * self.config.batch)
+        return loss, mse
 
-    def _next_view(self) -> View:
-        """Draw pictures in a random order, each once before any comes again."""
-        if not self.queue:
-            self.queue = torch.randperm(len(self.views), generator=self.rng).tolist()
-        return self.views[self.queue.pop()]
+    def _learn(self, view: View, picture: np.ndarray) -> tuple[float, float]:
+        """Render one view, compare it, and add to the gradients."""
+        target = torch.from_numpy(picture).to(torch.float32).mul_(1.0 / 255.0)
+        rendering = self.render(self.capture.cameras[view[0]], self.capture.time(view[1]), training=True)
+        loss = self.backend.l1_dssim(rendering.features, target, self.config.dssim_weight)
+        value = float(loss.detach())
+        if not math.isfinite(value):
+            raise HoloreelError(
+                f"{self.capture.source}: the loss is not finite at iteration {self.iteration + 1} (camera "
+                f"{view[0]!r}, frame {view[1]}); lower the learning rates, --rates.means and --rates.scales first."
+            )
+        (loss / self.config.batch).backward()
+        return value, float((rendering.features.detach() - target).square().mean())
 
-    def _rates(self) -> Mapping[str, float]:
+    def render(self, camera: Camera, time: float, training: bool = False) -> Rendering:
+        """Render what has been learned as a camera sees it at a normalized time: colors (H, W, 3), alpha, depth."""
+        gaussians, network = self.parameters.spacetime, self.parameters.network
+        density = self.parameters.stats if training else None
+        if not network:
+            return self.backend.rasterize_spacetime(gaussians, time, camera, self.background, self.rules, density)
+        dt = (time - gaussians.trbf_centers)[:, None]
+        dt = dt.detach() if self.config.detach_time else dt
+        features = torch.cat([gaussians.features[:, :6], gaussians.features[:, 6:] * dt], dim=1)
+        rendering = self.backend.rasterize_spacetime(
+            gaussians._replace(features=features), time, camera, None, self.rules, density
+        )
+        colors = self.backend.decode(
+            rendering.features, camera, network["hidden"], network["output"], self.config.decoder_output
+        )
+        return rendering._replace(features=colors)
+
+    def _pace(self) -> float:
+        """Return what is left of the positions' learning rate."""
+        rates = self.config.rates
+        return (rates.means_final / rates.means) ** (self.iteration / self.config.planned)
+
+    def _rates(self) -> dict[str, float | Tensor]:
         """Return the learning rate of each tensor at this iteration."""
-        rates, done = self.config.rates, self.iteration / self.config.iterations
-        decay = rates.final_factor**done
-        means = rates.means * (rates.means_final / rates.means) ** done
+        config, rates, units = self.config, self.config.rates, self.parameters.units
+        decay = rates.final_factor ** (self.iteration / config.planned)
+        orders = (torch.arange(3) < config.motion).to(torch.float32)[:, None]
+        features: float | Tensor = rates.features * decay
+        if config.model == "full":
+            features = torch.tensor([rates.features * decay] * 6 + [rates.features_time * decay] * 3)
+        inputs = torch.ones(DECODER["hidden"][1])
+        inputs[6:9] = self._origin_scale()
+        temporal = decay if config.temporal_opacity else 0.0
         return {
-            "means": means * self.scene.footprint,
-            "motions": rates.motions * self.scene.footprint * decay,
+            "means": (rates.means * self._pace()) * units[:, None],
+            "motions": (rates.motions * decay) * units[:, None, None] * orders if config.motion else 0.0,
             "quats": rates.quats * decay,
-            "omegas": rates.omegas * decay,
+            "omegas": rates.omegas * decay if config.rotation else 0.0,
             "log_scales": rates.scales * decay,
             "opacity_logits": rates.opacities * decay,
-            "features": rates.features * decay,
-            "trbf_centers": rates.trbf_centers * decay,
-            "trbf_log_scales": rates.trbf_scales * decay,
+            "features": features,
+            "trbf_centers": rates.trbf_centers * temporal,
+            "trbf_log_scales": rates.trbf_scales * temporal,
+            "hidden": rates.decoder * decay * inputs,
+            "output": rates.decoder * decay,
         }
 
-    def _control_density(self, width: int) -> None:
-        config = self.config.density
-        if self.iteration in self.densify_at:
-            densify(self.parameters, self.stats, config, self.scene, width, self.rng)
-            self.stats = empty_stats(len(self.parameters))
-        if self.iteration % config.prune_every == 0 or self.iteration == self.config.iterations:
-            keep = prune(self.parameters, self.times, config, self.scene)
-            for name in ("gradient", "views", "radius_px"):
-                setattr(self.stats, name, getattr(self.stats, name)[keep])
-            if not len(self.parameters):
-                raise HoloreelError(
-                    f"{self.capture.source}: every Gaussian was pruned at iteration {self.iteration}; "
-                    "check the cameras, or lower --density.prune-opacity."
-                )
-        if self.iteration in self.reset_at:
-            reset_opacities(self.parameters, config.reset_opacity)
+    def _control_number(self, loss: float, pixels: float) -> None:
+        """Add and delete Gaussians where it is time to."""
+        lost = self.control.after_step(self.parameters, self.iteration, pixels, self._pace(), self.rng)
+        self.lost.update(lost)
+        guided, done = self.config.guided, self.iteration / self.config.planned
+        if self.stability.add(loss) and len(self.guided_at) < guided.times and guided.start <= done <= guided.stop:
+            self._sample_guided()
+        count = len(self.parameters)
+        self.most = max(self.most, count)
+        if count <= FEWEST_PART * self.most:
+            reasons = ", ".join(f"{number} {cause}" for cause, number in self.lost.most_common() if number)
+            setting = SETTINGS[self.lost.most_common(1)[0][0]]
+            raise HoloreelError(
+                f"{self.capture.source}: {count} Gaussians are left at iteration {self.iteration}, of {self.most} at "
+                f"most (deleted: {reasons}); {setting}, or check the cameras and the seed points."
+            )
+
+    def _sample_guided(self) -> None:
+        """Add Gaussians along rays through the worst patches (Sec. 4.4)."""
+        config = self.config.guided
+        self.guided_at.append(self.iteration)
+        self.stability.reset()
+        count = min(len(self.views), max(GUIDED_VIEWS, len(self.scene.centers)))
+        views = [self.views[index] for index in torch.randperm(len(self.views), generator=self.rng)[:count].tolist()]
+        looked = [self._measure_view(view) for view in views]
+        chosen = worst_patches([patches for patches, _ in looked], config.share, config.contrast)
+        random = np.random.default_rng([self.config.seed, self.iteration])
+        room = self.config.density.max_gaussians - len(self.parameters)
+        for view, patches, (_, reach) in zip(views, chosen, looked, strict=True):
+            patches = patches.take(np.arange(min(len(patches.errors), max(room, 0) // config.samples)))
+            if reach is None or not len(patches.errors):
+                continue
+            camera = self.capture.cameras[view[0]]
+            points, sizes = sample_rays(camera, patches, config.patch, reach, config, random)
+            colors = np.repeat(patches.colors, config.samples, axis=0)
+            fresh = new_gaussians(
+                points, sizes, colors, self.capture.time(view[1]), self.config.static_width, config.opacity
+            )
+            fresh = as_trained(fresh.without_bad_rows(), self.config)
+            self.parameters.append({name: torch.from_numpy(getattr(fresh, name)) for name in self.parameters.tensors})
+            room -= len(fresh)
+
+    def _measure_view(self, view: View) -> tuple[Patches, tuple[float, float] | None]:
+        """Return a view's patches and how far its rays should reach."""
+        config, camera = self.config.guided, self.capture.cameras[view[0]]
+        truth = self.capture.image(*view, background=self.config.background).astype(np.float32) / 255.0
+        rendering = self.render(camera, self.capture.time(view[1]))
+        patches = measure_patches(rendering.features.numpy(), truth, config.patch)
+        return patches, depth_range(rendering.depth.numpy(), rendering.alpha.numpy(), config.far)
 
     def gaussians(self) -> SpacetimeGaussians:
         """Copy the trained Gaussians out."""
@@ -239,21 +356,24 @@ class Trainer:
         return {
             "config": asdict(self.config),
             "parameters": self.parameters.state(),
-            "stats": {"gradient": self.stats.gradient, "views": self.stats.views, "radius_px": self.stats.radius_px},
             "rng": self.rng.get_state(),
-            "queue": list(self.queue),
+            "pictures": self.pictures.state(),
             "iteration": self.iteration,
             "seconds": self.seconds,
             "history": [list(row) for row in self.history],
+            "most": self.most,
+            "lost": dict(self.lost),
+            "stability": self.stability.state(),
+            "guided_at": list(self.guided_at),
         }
 
     def load_state(self, state: Mapping) -> None:
         """Go on where `state` was taken."""
-        self.parameters = Parameters.from_state(state["parameters"])
-        self.stats = empty_stats(0)
-        for name, value in state["stats"].items():
-            setattr(self.stats, name, value.clone())
+        self.parameters = Parameters.from_state(state["parameters"], self.measure)
         self.rng.set_state(state["rng"])
-        self.queue = list(state["queue"])
+        self.pictures.load_state(state["pictures"])
         self.iteration, self.seconds = int(state["iteration"]), float(state["seconds"])
         self.history = [(int(i), float(a), float(b), int(n)) for i, a, b, n in state["history"]]
+        self.most, self.lost = int(state["most"]), Counter(state["lost"])
+        self.stability.load_state(state["stability"])
+        self.guided_at = [int(at) for at in state["guided_at"]]

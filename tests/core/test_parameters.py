@@ -5,13 +5,31 @@ import numpy as np
 import pytest
 import torch
 from holoreel.core.gaussians.config import DensityConfig
-from holoreel.core.gaussians.density import SceneScale, densify, empty_stats, prune, reset_opacities
+from holoreel.core.gaussians.density import (
+    broken_rows,
+    densify,
+    near_rows,
+    outside_rows,
+    peak_opacity,
+    prune,
+    reset_opacities,
+)
 from holoreel.core.gaussians.model import SpacetimeGaussians
 from holoreel.core.gaussians.parameters import BETAS, EPSILON, Parameters
+from holoreel.core.gaussians.scale import SceneScale
 from holoreel.core.render import reference
 from holoreel.core.render.reference import rotation_matrices
 
-SCENE = SceneScale(footprint=0.01, nearest=1.0, centers=torch.zeros(1, 3))
+SCENE = SceneScale(
+    footprint=0.01,
+    nearest=1.0,
+    centers=torch.zeros(1, 3),
+    extent=2.0,
+    box=torch.tensor([[-9.0] * 3, [1.9] * 3]),
+    axes=torch.tensor([[0.0, 0.0, 1.0]]),
+    cosines=torch.tensor([0.5]),
+    focals=torch.tensor([100.0]),
+)
 
 
 def make_gaussians(count: int, seed: int = 0) -> SpacetimeGaussians:
@@ -62,15 +80,19 @@ def test_keep_and_append_move_moments_with_their_rows() -> None:
         assert parameters.tensors[name].requires_grad
 
 
+def measured(count: int, **values: object) -> Parameters:
+    """Parameters whose unit of length is one pixel of the camera of `SCENE`."""
+    return Parameters(make_gaussians(count, **values), measure=SCENE.footprints)
+
+
 def test_densify_clones_small_splits_large_and_leaves_the_rest() -> None:
-    parameters = Parameters(make_gaussians(3))
+    parameters = measured(3)
     with torch.no_grad():
         parameters.tensors["log_scales"][:] = torch.log(torch.tensor([[0.001], [0.5], [0.5]]))
     before = parameters.rows(torch.arange(3))
-    stats = empty_stats(3)
-    stats.gradient[:] = torch.tensor([1.0, 1.0, 0.0])
-    stats.views[:] = 1
-    added = densify(parameters, stats, DensityConfig(), SCENE, 100, torch.Generator().manual_seed(0))
+    parameters.stats.gradient[:] = torch.tensor([1.0, 1.0, 0.0])
+    parameters.stats.views[:] = 1
+    added = densify(parameters, DensityConfig(), 50.0, torch.Generator().manual_seed(0))
     assert added == 2
     assert len(parameters) == 5  # 0 and its clone, 1's two children, 2
     after = parameters.tensors
@@ -78,31 +100,110 @@ def test_densify_clones_small_splits_large_and_leaves_the_rest() -> None:
     assert torch.equal(after["means"][2], before["means"][0])
     torch.testing.assert_close(after["log_scales"][3:].exp(), torch.full((2, 3), 0.5 / 1.6))
     assert not torch.equal(after["means"][3], after["means"][4])
+    torch.testing.assert_close(parameters.units, SCENE.footprints(after["means"].detach()))
+    assert not parameters.stats.gradient.any()
+    assert len(parameters.stats.views) == 5
+    assert torch.equal(after["trbf_centers"][3], before["trbf_centers"][1])
+
+
+def test_children_have_random_times_where_asked() -> None:
+    parameters = measured(40)
+    parameters.stats.gradient[:], parameters.stats.views[:] = 1.0, 1
+    before = set(parameters.tensors["trbf_centers"].tolist())
+    densify(parameters, DensityConfig(random_centers=True), 50.0, torch.Generator().manual_seed(0))
+    fresh = [center for center in parameters.tensors["trbf_centers"].tolist() if center not in before]
+    assert len(fresh) >= 40
+    assert min(fresh) >= 0
+    assert max(fresh) < 1
+
+
+def test_a_batch_asks_for_the_same_pull() -> None:
+    """The loss of a step is the mean of its pictures, and so are the gradients of each of them."""
+    one, two = measured(30), measured(30)
+    one.stats.gradient[:], two.stats.gradient[:] = torch.linspace(0, 4e-5, 30), torch.linspace(0, 2e-5, 30)
+    one.stats.views[:], two.stats.views[:] = 1, 1
+    config = DensityConfig()
+    added = densify(one, config, 50.0, torch.Generator().manual_seed(0))
+    assert 0 < added < 30
+    assert densify(two, config, 100.0, torch.Generator().manual_seed(0)) == added
 
 
 def test_densify_respects_the_limit() -> None:
-    parameters = Parameters(make_gaussians(50))
-    stats = empty_stats(50)
-    stats.gradient[:] = torch.linspace(1, 2, 50)
-    stats.views[:] = 1
-    densify(parameters, stats, DensityConfig(max_gaussians=60), SCENE, 100, torch.Generator().manual_seed(0))
+    parameters = measured(50)
+    parameters.stats.gradient[:] = torch.linspace(1, 2, 50)
+    parameters.stats.views[:] = 1
+    densify(parameters, DensityConfig(max_gaussians=60), 50.0, torch.Generator().manual_seed(0))
     assert len(parameters) == 60
-    full = Parameters(make_gaussians(50))
-    assert densify(full, stats, DensityConfig(max_gaussians=50), SCENE, 100, torch.Generator()) == 0
+    full = measured(50)
+    full.stats.gradient[:], full.stats.views[:] = 1.0, 1
+    assert densify(full, DensityConfig(max_gaussians=50), 50.0, torch.Generator()) == 0
 
 
-def test_prune_takes_the_invisible_the_broken_and_the_near() -> None:
-    parameters = Parameters(make_gaussians(5))
+def test_prune_takes_the_invisible_the_broken_the_near_and_the_far_and_counts_them() -> None:
+    parameters = measured(6)
+    times = torch.tensor([0.0, 0.5])
     with torch.no_grad():
+        parameters.tensors["means"].clamp_(max=1.8)
         parameters.tensors["opacity_logits"][:] = 2.0
         parameters.tensors["trbf_centers"][:] = 0.5
         parameters.tensors["opacity_logits"][0] = -8.0  # too faint
         parameters.tensors["trbf_centers"][1], parameters.tensors["trbf_log_scales"][1] = 3.0, -3.0  # never there
         parameters.tensors["omegas"][2, 3] = float("nan")  # broken
         parameters.tensors["means"][3] = torch.tensor([0.0, 0.0, 0.1])  # in front of a camera
-    keep = prune(parameters, torch.tensor([0.0, 0.5]), DensityConfig(prune_depth=0.2), SCENE)
-    assert keep.tolist() == [False, False, False, False, True]
+        parameters.tensors["means"][5] = 5.0  # outside the seeds' box
+    kept = parameters.tensors["means"][4].clone()
+    causes = {
+        "broken": broken_rows(parameters),
+        "faint": peak_opacity(parameters, times) < 0.02,
+        "near": near_rows(parameters, SCENE, 0.2),
+        "outside": outside_rows(parameters, SCENE),
+    }
+    assert [rows.tolist() for rows in causes.values()] == [
+        [row == 2 for row in range(6)],
+        [row in (0, 1) for row in range(6)],
+        [row == 3 for row in range(6)],
+        [row == 5 for row in range(6)],
+    ]
+    causes["again"] = causes["near"]
+    assert prune(parameters, causes) == {"broken": 1, "faint": 2, "near": 1, "outside": 1, "again": 0}
     assert len(parameters) == 1
+    assert torch.equal(parameters.tensors["means"][0], kept)
+
+
+@pytest.mark.parametrize("frames", [1, 2, 7])
+def test_peak_opacity_is_the_largest_over_the_frames(frames: int) -> None:
+    model = make_gaussians(60)
+    model.trbf_centers = np.random.default_rng(1).uniform(-0.5, 1.5, 60).astype(np.float32)
+    times = np.arange(frames) / frames
+    wanted = np.max([model.evaluate(time).opacities for time in times], axis=0)
+    found = peak_opacity(Parameters(model), torch.tensor(times, dtype=torch.float32))
+    np.testing.assert_allclose(found.numpy(), wanted, rtol=1e-4, atol=1e-7)
+
+
+def test_rates_may_differ_by_row_and_zero_means_frozen() -> None:
+    """Adam does not care how large gradients are, so a rate of ten is ten steps' worth of moving."""
+    parameters = Parameters(make_gaussians(4), {"hidden": torch.ones(6, 12), "output": torch.ones(3, 6)})
+    before = {name: value.detach().clone() for name, value in (parameters.tensors | parameters.network).items()}
+    for value in (*parameters.tensors.values(), *parameters.network.values()):
+        value.grad = torch.full_like(value, 1e-6)
+    rates = dict.fromkeys(before, 0.0) | {"means": torch.tensor([[1.0], [10.0], [0.0], [2.0]]), "hidden": 0.5}
+    parameters.step(rates, reference)
+    moved = {name: before[name] - value.detach() for name, value in (parameters.tensors | parameters.network).items()}
+    torch.testing.assert_close(moved["means"], torch.tensor([[1.0], [10.0], [0.0], [2.0]]).expand(4, 3))
+    torch.testing.assert_close(moved["hidden"], torch.full((6, 12), 0.5))
+    assert not any(value.any() for name, value in moved.items() if name not in ("means", "hidden"))
+
+
+def test_state_keeps_everything() -> None:
+    parameters = Parameters(make_gaussians(5), {"hidden": torch.ones(6, 12), "output": torch.ones(3, 6)})
+    parameters.stats.gradient[:] = torch.arange(5.0)
+    parameters.units *= 3
+    again = Parameters.from_state(parameters.state())
+    assert again.state().keys() == parameters.state().keys()
+    assert torch.equal(again.units, parameters.units)
+    assert torch.equal(again.stats.gradient, parameters.stats.gradient)
+    again.units += 1
+    assert not torch.equal(again.units, parameters.units)  # a copy
 
 
 def test_reset_caps_opacities_and_forgets_their_momentum() -> None:

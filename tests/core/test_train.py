@@ -202,7 +202,7 @@ def test_captures_that_cannot_be_trained(capture: Capture) -> None:
     no_training = Capture(capture.cameras, capture.images, FRAMES, everything_held_out, seeds=capture.seeds)
     with pytest.raises(HoloreelError, match="hold fewer cameras out"):
         Trainer(no_training, QUICK, get_backend())
-    with pytest.raises(HoloreelError, match="no seed points"):
+    with pytest.raises(HoloreelError, match="holoreel sfm"):
         Trainer(Capture(capture.cameras, capture.images, FRAMES), QUICK, get_backend())
 
 
