@@ -26,7 +26,15 @@ class Points:
 
 
 def read_points(path: str | Path) -> Points:
-    """Read a PLY of points; those without colors come out middle gray. Refuses positions that are not finite."""
+    """Read a PLY of points, or COLMAP's points3D.bin or .txt; points without colors come out middle gray.
+
+    Refuses positions that are not finite.
+    """
+    path = Path(path)
+    if path.name in ("points3D.bin", "points3D.txt"):
+        from .colmap_model import read_points3d  # which needs `Points`
+
+        return read_points3d(path)
     table = read_vertices(path)
     names = table.dtype.names or ()
     if missing := [name for name in _AXES if name not in names]:

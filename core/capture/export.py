@@ -1,0 +1,155 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""What the writers of all layouts share: pictures and videos of any capture, written one by one and never twice.
+
+A file that exists already is taken for written (each appears only when it is whole), so that a stopped export goes on.
+"""
+
+import re
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass, field
+from fractions import Fraction
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..camera import Camera
+from ..errors import HoloreelError
+from ..files import atomic_path
+from .capture import Capture
+from .resample import lens_map, same_lens
+
+Picture = NDArray[np.uint8]
+_QUALITY = "10"  # x264's constant rate factor: the difference to the source is under the pictures' own noise
+_PNG_LEVEL = 3  # zlib's: twice as fast as the usual 6, a few percent larger
+
+
+@dataclass
+class Export:
+    """How an export is done, and what it has to tell."""
+
+    background: tuple[float, float, float] = (0.0, 0.0, 0.0)  # behind transparent pictures, where a layout has no alpha
+    on_progress: Callable[[int, int], None] | None = None  # pictures done, and all
+    notes: list[str] = field(default_factory=list)  # sentences about what the layout could not hold
+
+    def show(self, done: int, total: int) -> None:
+        """Report progress to whoever listens."""
+        if self.on_progress:
+            self.on_progress(done, total)
+
+
+def write_text(path: Path, text: str) -> None:
+    """Write a text file, atomically."""
+    with atomic_path(path) as temporary:
+        temporary.write_text(text, encoding="utf-8")
+
+
+def file_names(capture: Capture) -> dict[str, str]:
+    """Return a file name (without ending) for each camera: its own name, without what no file may have."""
+    names = {name: re.sub(r"[^\w.-]", "_", name).lstrip(".") or "camera" for name in capture.cameras}
+    if len(set(names.values())) < len(names):
+        names = {name: f"cam{index:02d}" for index, name in enumerate(capture.cameras)}
+    return names
+
+
+def held_out_first(capture: Capture) -> list[str]:
+    """Return the cameras' names, the held-out ones first."""
+    return [*capture.camera_names("test"), *capture.camera_names("train")]
+
+
+def write_pictures(
+    capture: Capture,
+    targets: Mapping[str, Camera],
+    place: Callable[[str, int], Path],
+    export: Export,
+    alpha: bool = False,
+) -> None:
+    """Write every view as the PNG `place(camera, frame)`, seen through the lens of its camera in `targets`."""
+    _note_lenses(capture, targets, export)
+    views = [(name, j) for name in targets for j in range(capture.frame_count) if (name, j) in capture.images]
+    lens = _Lenses(capture, targets)
+    for done, (name, frame) in enumerate(views):
+        export.show(done, len(views))
+        path = place(name, frame)
+        if not path.is_file():
+            _write_png(path, lens.picture(name, frame, None if alpha else export.background))
+    export.show(len(views), len(views))
+
+
+def write_videos(capture: Capture, targets: Mapping[str, Camera], places: Mapping[str, Path], export: Export) -> None:
+    """Write one H.264 video per camera, seen through its lens in `targets`; every camera must have all frames."""
+    _note_lenses(capture, targets, export)
+    lacking = [(name, j) for j in range(capture.frame_count) for name in targets if (name, j) not in capture.images]
+    if lacking:
+        raise HoloreelError(
+            f"{capture.source}: camera {lacking[0][0]!r} has no picture of frame {lacking[0][1]}, and a video needs "
+            "all of them; take the frames that all cameras have by --frames."
+        )
+    total = len(targets) * capture.frame_count
+    lens = _Lenses(capture, targets)
+
+    def pictures(start: int, name: str) -> Iterator[Picture]:
+        for frame in range(capture.frame_count):
+            export.show(start + frame, total)
+            yield lens.picture(name, frame, export.background)
+
+    for index, name in enumerate(targets):
+        if not places[name].is_file():
+            size = targets[name].width, targets[name].height
+            encode_video(places[name], size, capture.fps, pictures(index * capture.frame_count, name))
+        export.show((index + 1) * capture.frame_count, total)
+
+
+def encode_video(path: Path, size: tuple[int, int], fps: float, pictures: Iterable[Picture]) -> None:
+    """Write (H, W, 3) pictures of `size` (width, height) as H.264 in MP4, atomically.
+
+    Colors are kept at full resolution (4:4:4), in BT.709, and the file says so.
+    """
+    import av
+
+    rate = Fraction(fps).limit_denominator(1001)
+    with atomic_path(path) as temporary, av.open(str(temporary), "w", format="mp4") as container:
+        stream = container.add_stream("libx264", rate=rate, options={"crf": _QUALITY, "preset": "medium"})
+        stream.pix_fmt = "yuv444p"
+        stream.width, stream.height = size
+        context = stream.codec_context
+        context.color_range, context.colorspace, context.color_primaries, context.color_trc = 1, 1, 1, 1
+        for picture in pictures:
+            frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(picture), format="rgb24")
+            for packet in stream.encode(
+                frame.reformat(format="yuv444p", dst_colorspace="ITU709", dst_color_range="MPEG")
+            ):
+                container.mux(packet)
+        for packet in stream.encode():
+            container.mux(packet)
+
+
+class _Lenses:
+    """Reads pictures of a capture and shows them through other lenses; keeps the map of the camera at work."""
+
+    def __init__(self, capture: Capture, targets: Mapping[str, Camera]) -> None:
+        self._capture, self._targets = capture, targets
+        self._name, self._map = "", None
+
+    def picture(self, name: str, frame: int, background: tuple[float, float, float] | None) -> Picture:
+        picture = self._capture.image(name, frame, background)
+        if self._name != name:
+            source, target = self._capture.cameras[name], self._targets[name]
+            self._name, self._map = name, None if same_lens(source, target) else lens_map(source, target)
+        return picture if self._map is None else self._map.apply(picture)
+
+
+def _note_lenses(capture: Capture, targets: Mapping[str, Camera], export: Export) -> None:
+    changed = [name for name in targets if not same_lens(capture.cameras[name], targets[name])]
+    if changed:
+        export.notes.append(
+            f"Pictures of {len(changed)} of {len(targets)} cameras are resampled: "
+            "the layout cannot describe their lenses."
+        )
+
+
+def _write_png(path: Path, picture: Picture) -> None:
+    import imageio.v3 as iio
+
+    with atomic_path(path) as temporary:
+        iio.imwrite(temporary, picture, plugin="pillow", extension=".png", compress_level=_PNG_LEVEL)

@@ -1,0 +1,172 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The layouts of captures on disk, as a table; reading one, whichever it is."""
+
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from ..errors import HoloreelError
+from . import colmap, immersive, n3v, nerfstudio, sfm_result, technicolor, videos
+from .capture import Capture
+from .export import Export, file_names, write_pictures
+from .options import CaptureOptions
+from .points import write_points
+
+
+@dataclass(frozen=True)
+class Layout:
+    """One dataset's way to lay its files out, and its authors' protocol."""
+
+    files: str  # what lies there, for messages
+    matches: Callable[[Path], bool]
+    read: Callable[[Path, CaptureOptions], Capture]
+    write: Callable[[Capture, Path, Export], None]
+    scale: int = 1  # by which the protocol divides the size of the pictures
+    held_out: str | None = ""  # the camera to test on; the first where there is none of that name; None: the files say
+    holds_seeds: bool = False
+
+
+def _read_nerfstudio(path: Path, options: CaptureOptions) -> Capture:
+    capture = nerfstudio.read_capture(path)
+    start = capture.frame_start
+    chosen = options.choose_frames(capture.source, range(start, start + capture.frame_count))
+    return capture.frames(chosen.start - start, len(chosen))
+
+
+def _write_nerfstudio(capture: Capture, path: Path, export: Export) -> None:
+    """Write images/CAMERA/FRAME.png, points/FRAME.ply and transforms.json into `path`."""
+    names = file_names(capture)
+
+    def place(name: str, frame: int) -> Path:
+        return path / "images" / names[name] / f"{capture.frame_start + frame:06d}.png"
+
+    write_pictures(capture, dict(capture.cameras), place, export, alpha=True)
+    seeds = {j: path / "points" / f"{capture.frame_start + j:06d}.ply" for j in capture.seeds}
+    for frame, file in seeds.items():
+        write_points(file, capture.seed_points(frame))
+    if capture.depths:
+        export.notes.append("Depth maps are not taken along.")
+    images = {view: place(*view) for view in capture.images}
+    nerfstudio.write_capture(path, replace(capture, images=images, seeds=seeds, depths={}))
+
+
+LAYOUTS = {
+    "nerfstudio": Layout(
+        nerfstudio.FILE_NAME,
+        lambda path: path.name == nerfstudio.FILE_NAME or (path / nerfstudio.FILE_NAME).is_file(),
+        _read_nerfstudio,
+        _write_nerfstudio,
+        held_out=None,
+        holds_seeds=True,
+    ),
+    "n3v": Layout("cam??.mp4 and poses_bounds.npy", n3v.matches, n3v.read, n3v.write, scale=2),
+    "technicolor": Layout(
+        "SCENE_undist_FRAME_CAMERA.png and cameras_parameters.txt",
+        technicolor.matches,
+        technicolor.read,
+        technicolor.write,
+        held_out=technicolor.HELD_OUT,
+    ),
+    "immersive": Layout(
+        "models.json and a video per camera",
+        immersive.matches,
+        immersive.read,
+        immersive.write,
+        scale=2,
+        held_out=immersive.HELD_OUT,
+    ),
+    "colmap": Layout(
+        "images and sparse/0, or folders colmap_FRAME", colmap.matches, colmap.read, colmap.write, holds_seeds=True
+    ),
+    "videos": Layout("a video per camera", videos.matches, videos.read, videos.write),
+}
+
+
+def read_capture(path: str | Path, options: CaptureOptions | None = None, **changes: Any) -> Capture:
+    """Read the capture that lies at `path`: a folder in any of the `LAYOUTS`, or a transforms.json.
+
+    `changes` are single fields of `CaptureOptions`, as in `read_capture(path, layout="n3v", scale=4)`. What
+    `holoreel sfm` left in the folder is attached where the capture has no seed points of its own. Raises
+    `HoloreelError` saying what lies there where it is not what was expected.
+    """
+    path = Path(path)
+    options = replace(options or CaptureOptions(), **changes)
+    name = find_layout(path, options)
+    capture = LAYOUTS[name].read(path, options)
+    folder = options.sfm or (path if path.is_dir() else path.parent) / sfm_result.FOLDER
+    if options.sfm or (not capture.seeds and sfm_result.has_result(folder)):
+        capture = sfm_result.attach(capture, folder)
+    return finish(capture, options, LAYOUTS[name])
+
+
+def find_layout(path: Path, options: CaptureOptions) -> str:
+    """Return the name of the layout of what lies at `path`; raises `HoloreelError` where it is none."""
+    if options.layout != "auto":
+        if options.layout not in LAYOUTS:
+            raise HoloreelError(f"--layout {options.layout}: no such layout; take one of auto, {', '.join(LAYOUTS)}.")
+        if not LAYOUTS[options.layout].matches(path):
+            raise HoloreelError(
+                f"{path} {_contents(path)}, no {options.layout} capture ({LAYOUTS[options.layout].files}); give the "
+                "folder of one, or another --layout."
+            )
+        return options.layout
+    if path.suffix.lower() == ".json" and not path.is_dir():
+        return "nerfstudio"
+    for name, layout in LAYOUTS.items():
+        if layout.matches(path):
+            return name
+    known = "; ".join(layout.files for layout in LAYOUTS.values())
+    raise HoloreelError(f"{path} {_contents(path)}, none of the captures that can be read ({known}).")
+
+
+def _contents(path: Path) -> str:
+    """What lies at `path`, in a few words."""
+    if not path.is_dir():
+        return "is a file" if path.is_file() else "is not there"
+    kinds = Counter("folders" if entry.is_dir() else (entry.suffix or "other") for entry in path.iterdir())
+    if not kinds:
+        return "is an empty folder"
+    return "holds " + ", ".join(f"{count} {kind}" for kind, count in kinds.most_common(4))
+
+
+def finish(capture: Capture, options: CaptureOptions, layout: Layout) -> Capture:
+    """Apply what every layout has in common: held-out cameras, size, rate and the place on the timeline."""
+    scale = options.scale or layout.scale
+    changes: dict[str, Any] = {"splits": _splits(capture, options, layout)}
+    if scale > 1:
+        changes["cameras"] = {name: _scaled(capture, name, scale) for name in capture.cameras}
+        changes["depths"] = {}  # depths of a coarser grid are no means of finer ones
+    if options.fps is not None:
+        changes["fps"] = options.fps
+    if options.frame_start is not None:
+        changes["frame_start"] = options.frame_start
+    return replace(capture, **changes)
+
+
+def _splits(capture: Capture, options: CaptureOptions, layout: Layout) -> dict[str, str]:
+    if options.test_cameras:
+        held_out = [name for name in options.test_cameras if name != "none"]
+        if unknown := [name for name in held_out if name not in capture.cameras]:
+            raise HoloreelError(
+                f"{capture.source}: there is no camera {unknown[0]!r} to hold out; it has "
+                f"{', '.join(list(capture.cameras)[:50])}."
+            )
+    elif layout.held_out is None:
+        return capture.splits
+    elif len(capture.cameras) == 1:
+        held_out = []
+    else:
+        held_out = [layout.held_out if layout.held_out in capture.cameras else next(iter(capture.cameras))]
+    return {name: "test" if name in held_out else "train" for name in capture.cameras}
+
+
+def _scaled(capture: Capture, name: str, scale: int) -> Any:
+    camera = capture.cameras[name]
+    if camera.width % scale or camera.height % scale:
+        raise HoloreelError(
+            f"{capture.source}: {name} is {camera.width}x{camera.height}, which --scale {scale} does not divide; "
+            "choose another --scale."
+        )
+    return camera.scaled(camera.width // scale, camera.height // scale)

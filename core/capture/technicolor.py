@@ -1,0 +1,155 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Technicolor light fields (Sabater et al., 2017): cameras_parameters.txt and SCENE_undist_FRAME_CAMERA.png.
+
+cameras_parameters.txt has a line of headings, then one row per camera: focal length, principal point (cu, cv), aspect
+ratio (fy / fx), skew, world-to-camera quaternion w x y z and translation. Pictures are undistorted; frames have five
+digits, cameras two, counted from 0. The authors hold cam10 out.
+"""
+
+import re
+from pathlib import Path
+
+from ..camera import Camera
+from ..errors import HoloreelError
+from .capture import MAX_FRAMES, Capture, View
+from .export import Export, held_out_first, write_pictures, write_text
+from .images import picture_size
+from .options import CaptureOptions
+from .rotations import matrix_from_quaternion, quaternion_from_matrix
+
+FILE_NAME = "cameras_parameters.txt"
+HEADINGS = "f cu cv ar sk qw qx qy qz tx ty tz"
+HELD_OUT = "cam10"
+_PICTURE = re.compile(r"(?P<scene>.+)_undist_(?P<frame>\d{1,7})_(?P<camera>\d{1,4})\.png")
+_MAX_CAMERAS = 10_000
+_MAX_BYTES = 1 << 22
+_MAX_SKEW = 1e-3  # of the focal length: what is smaller moves no pixel by one
+
+
+def matches(path: Path) -> bool:
+    """Whether cameras_parameters.txt lies in the folder."""
+    return (path / FILE_NAME).is_file()
+
+
+def read(path: Path, options: CaptureOptions) -> Capture:
+    """Read the folder of a scene; only the chosen frames need to be there."""
+    file = path / FILE_NAME
+    rows = _rows(file)
+    pictures = _pictures(path)
+    numbers = sorted({frame for _, frame in pictures})
+    chosen = options.choose_frames(path, range(numbers[0], numbers[-1] + 1))
+    if len(chosen) > MAX_FRAMES:
+        raise HoloreelError(f"{path}: {len(chosen)} frames are more than {MAX_FRAMES}; take a part by --frames.")
+    if beyond := [camera for camera, _ in pictures if camera >= len(rows)]:
+        raise HoloreelError(
+            f"{path}: there are pictures of camera {beyond[0]}, but {FILE_NAME} has {len(rows)} rows; "
+            "fetch the files of one scene."
+        )
+    wanted = [(camera, frame) for frame in chosen for camera in range(len(rows))]
+    if missing := [view for view in wanted if view not in pictures]:
+        camera, frame = missing[0]
+        more = f" and {len(missing) - 1} more pictures are" if len(missing) > 1 else " is"
+        raise HoloreelError(
+            f"{path}: SCENE_undist_{frame:05d}_{camera:02d}.png{more} missing; fetch what is missing, "
+            "or choose other --frames."
+        )
+    cameras = {}
+    for index, row in enumerate(rows):
+        name = f"cam{index:02d}"
+        cameras[name] = _camera(file, index, row, picture_size(pictures[index, chosen.start]), name)
+    images: dict[View, Path] = {
+        (f"cam{c:02d}", j): pictures[c, n] for j, n in enumerate(chosen) for c in range(len(rows))
+    }
+    return Capture(
+        cameras=cameras,
+        images=images,
+        frame_count=len(chosen),
+        fps=options.fps or 30.0,
+        frame_start=chosen.start,
+        source=file,
+    )
+
+
+def _rows(file: Path) -> list[list[float]]:
+    try:
+        with file.open("rb") as stream:
+            text = stream.read(_MAX_BYTES + 1)
+    except OSError as error:
+        raise HoloreelError(f"{file} cannot be read ({error.strerror or error}): fetch it again.") from error
+    lines = [line.split() for line in text.decode("utf-8", "replace").splitlines()[1:] if line.strip()]
+    if not 1 <= len(lines) <= _MAX_CAMERAS or len(text) > _MAX_BYTES:
+        raise HoloreelError(f"{file} must have a line of headings and a row per camera: fetch it again.")
+    rows = []
+    for number, words in enumerate(lines):
+        try:
+            rows.append([float(word) for word in words])
+        except ValueError as error:
+            raise HoloreelError(f"{file}: row {number} is no row of numbers ({error}): fetch it again.") from error
+        if len(rows[-1]) != 12:
+            raise HoloreelError(f"{file}: row {number} has {len(words)} numbers, not the 12 of {HEADINGS!r}.")
+    return rows
+
+
+def _pictures(path: Path) -> dict[tuple[int, int], Path]:
+    """The pictures by (camera, frame number)."""
+    found: dict[tuple[int, int], Path] = {}
+    scenes: set[str] = set()
+    for file in path.iterdir():
+        if match := _PICTURE.fullmatch(file.name):
+            found[int(match["camera"]), int(match["frame"])] = file
+            scenes.add(match["scene"])
+    if len(scenes) != 1:
+        raise HoloreelError(
+            f"{path} holds pictures SCENE_undist_FRAME_CAMERA.png of "
+            f"{'the scenes ' + ', '.join(sorted(scenes)[:5]) if scenes else 'no scene'}; give the folder of one scene."
+        )
+    return found
+
+
+def _camera(file: Path, index: int, row: list[float], size: tuple[int, int], name: str) -> Camera:
+    focal, cu, cv, aspect, skew, *pose = row
+    if abs(skew) > _MAX_SKEW * abs(focal):
+        raise HoloreelError(f"{file}: row {index} has a skew of {skew:g}; undistort the pictures to square corners.")
+    matrix = [[0.0] * 4 for _ in range(3)] + [[0.0, 0.0, 0.0, 1.0]]
+    try:
+        rotation = matrix_from_quaternion(pose[:4]).tolist()
+        for line in range(3):
+            matrix[line] = [*rotation[line], pose[4 + line]]
+        return Camera(*size, focal, focal * aspect, cu, cv, matrix, name=name)  # type: ignore[arg-type]
+    except (HoloreelError, ValueError) as error:
+        raise HoloreelError(f"{file}: row {index}: {str(error).rstrip('.')}; fetch it again.") from error
+
+
+def target(camera: Camera) -> Camera:
+    """The camera without its distortion."""
+    return Camera(
+        camera.width,
+        camera.height,
+        camera.fx,
+        camera.fy,
+        camera.cx,
+        camera.cy,
+        camera.world_to_camera,
+        name=camera.name,
+    )
+
+
+def write(capture: Capture, path: Path, export: Export) -> None:
+    """Write PATH's name as the scene's; the held-out camera becomes number 10 where there are more than 10, else 0."""
+    order = held_out_first(capture)
+    if len(order) > 10:
+        order.insert(10, order.pop(0))
+    targets = {name: target(capture.cameras[name]) for name in order}
+    numbers = {name: number for number, name in enumerate(order)}
+
+    def place(name: str, frame: int) -> Path:
+        return path / f"{path.name}_undist_{capture.frame_start + frame:05d}_{numbers[name]:02d}.png"
+
+    write_pictures(capture, targets, place, export)
+    lines = [HEADINGS]
+    for camera in targets.values():
+        quaternion = quaternion_from_matrix(camera.world_to_camera[:3, :3]).tolist()
+        translation = camera.world_to_camera[:3, 3].tolist()
+        row = [camera.fx, camera.cx, camera.cy, camera.fy / camera.fx, 0.0, *quaternion, *translation]
+        lines.append(" ".join(map(repr, row)))
+    write_text(path / FILE_NAME, "\n".join(lines) + "\n")
