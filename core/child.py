@@ -16,6 +16,7 @@ from collections import deque
 from collections.abc import Callable, Iterable
 from contextlib import suppress
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import IO, Any
 
@@ -64,17 +65,21 @@ def run_child(
     log: str | Path,
     request: dict[str, Any] | None = None,
     on_event: Callable[[dict[str, Any]], None] | None = None,
+    on_start: Callable[[Callable[[], None]], None] | None = None,
     inherit: Iterable[int] = (),
 ) -> Ending:
     """Run `command`, hand it `request` as one line of JSON, and listen until it is done.
 
-    `on_event` gets each event, in this thread; an exception of it ends the child. File descriptors in `inherit` stay
-    open in the child. Raises OSError where the command cannot be run or the log not be written.
+    `on_event` gets each event, in this thread; an exception of it ends the child. `on_start` gets a function that ends
+    the child from any thread. File descriptors in `inherit` stay open in the child. Raises OSError where the command
+    cannot be run or the log not be written.
     """
     log = Path(log)
     log.parent.mkdir(parents=True, exist_ok=True)
     with open(log, "w", encoding="utf-8") as log_file, _start(command, inherit) as child:
         try:
+            if on_start:
+                on_start(partial(_kill_group, child))
             outcome = _converse(child, request, log_file, on_event)
             with suppress(subprocess.TimeoutExpired):  # it said all it had to say, and hangs at exit
                 child.wait(_PATIENCE_SECONDS)
@@ -156,10 +161,14 @@ def _event(line: str) -> dict[str, Any] | None:
 
 
 def _kill(child: subprocess.Popen[str]) -> None:
+    _kill_group(child)
+    child.wait()
+
+
+def _kill_group(child: subprocess.Popen[str]) -> None:
     """End the child and all it started."""
     if hasattr(os, "killpg"):
         with suppress(ProcessLookupError):
             os.killpg(child.pid, signal.SIGKILL)
     else:
         child.kill()
-    child.wait()

@@ -11,11 +11,13 @@ from ..errors import HoloreelError
 # the arguments themselves, `prepare(arguments)` returns that function instead.
 COMMANDS = {
     "synth": "render a multi-view capture from a Blender scene",
+    "sfm": "find points of the scene in every frame, and poses where a capture has none",
     "train": "train a reel from a capture",
     "render": "render a reel, PLY or .splatv from given cameras",
     "eval": "measure a reel against the held-out views of its capture",
     "info": "say what a reel, PLY, .splatv or capture holds, and what is wrong with it",
     "demo": "take a scene through the whole loop and write a report",
+    "convert": "write a capture in the layout of another dataset",
     "bench": "measure the kernels on this machine",
     "doctor": "say what works on this machine, and how to get what does not",
 }
