@@ -23,7 +23,8 @@ Array = NDArray[np.float64]
 
 MIN_PIXELS = 1.5
 MIN_DIAGONAL_SHARE = 0.002  # of a picture's diagonal: 3 px of 1280 x 720
-TIMES_TYPICAL = 4.0  # a contradiction is this much larger than what the best pairs and triples show
+TIMES_TYPICAL = 4.0  # a contradiction is this much larger than what the best pairs and triples show,
+TIMES_FLOOR = 2.5  # though never more than this much larger than the least that counts: all may be wrong
 
 _MIN_MATCHES = 15  # for a pair or a triple to have a say
 _MAX_SAMPLE = 300  # matches of one pair or triple of one frame
@@ -110,7 +111,8 @@ class CalibrationCheck:
         floor = max(MIN_PIXELS, MIN_DIAGONAL_SHARE * float(np.mean(diagonals)))
         if not medians:
             return floor
-        return max(floor, TIMES_TYPICAL * float(np.quantile(list(medians.values()), 0.2, method="lower")))
+        typical = float(np.quantile(list(medians.values()), 0.2, method="lower"))
+        return min(max(floor, TIMES_TYPICAL * typical), TIMES_FLOOR * floor)
 
     def _focal(self, index: int) -> float:
         """Pixels per radian in the middle of a picture."""
@@ -171,8 +173,9 @@ def refuse_contradictions(checks: Iterable[CameraCheck], source: object) -> None
     )  # fmt: skip
     rest = [check for check in checks if not check.contradicts and check.residual_px is not None]
     others = f", while the others agree within {_px(rest)}" if rest else ""
+    it, its = ("it", "its calibration") if len(wrong) == 1 else ("them", "their calibrations")
     raise HoloreelError(
-        f"{source}: {facts}{others}: its calibration contradicts theirs; calibrate it again, or leave it out with "
+        f"{source}: {facts}{others}: {its} must be wrong; calibrate {it} again, or leave {it} out with "
         f"--without {names}."
     )
 

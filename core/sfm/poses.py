@@ -22,8 +22,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..camera import Camera
-from ..capture import Capture, read_capture
+from ..capture import Capture, videos
 from ..capture.calibration import find_calibration
+from ..capture.layouts import LAYOUTS, find_layout, finish
 from ..capture.options import CaptureOptions
 from ..capture.sfm_result import has_result, read_result, with_cameras
 from ..errors import HoloreelError
@@ -61,24 +62,26 @@ def open_capture(
     on_message: OnMessage | None = None,
 ) -> Opened:
     """Read a capture; where it has no poses, take those that `folder` holds from an earlier call, or find them."""
-    from ..capture import videos
-
-    if not videos.matches(path) or options.layout not in ("auto", "videos") or _calibrated(path, options):
-        return Opened(read_capture(path, replace(options, sfm=None)))
+    # Points do not depend on the size of pictures or on numbers on the timeline, so these stay as the files have them.
+    options = replace(options, scale=options.scale or 1, frame_start=None)
+    layout = LAYOUTS[find_layout(path, options)]
+    if layout is not LAYOUTS["videos"] or _calibrated(path, options):
+        return Opened(finish(layout.read(path, options), options, layout))
     capture = videos.read_unposed(path, options)
     if has_result(folder) and not poses.refind and (before := read_result(folder)).posed_here:
         if on_message:
             on_message(f"{before.path}: the poses found before are kept; --refind finds them again.")
-        normalization = read_json(before.path).get("normalization")
-        return Opened(with_cameras(capture, before.cameras.values()), True, normalization)
-    found = find_poses(capture, settings, poses)
-    lost = [name for name in capture.cameras if name not in {camera.name for camera in found.cameras}]
-    if lost and on_message:
-        on_message(
-            f"warning: cameras {', '.join(lost)} could not be placed, for want of matches with the others; let their "
-            "views overlap more (20 to 30 degrees between neighbors), or take --quality high."
-        )
-    return Opened(with_cameras(capture, found.cameras), True, found.normalization)
+        cameras, normalization = list(before.cameras.values()), read_json(before.path).get("normalization")
+    else:
+        found = find_poses(capture, settings, poses)
+        cameras, normalization = found.cameras, found.normalization
+        lost = [name for name in capture.cameras if name not in {camera.name for camera in cameras}]
+        if lost and on_message:
+            on_message(
+                f"warning: cameras {', '.join(lost)} could not be placed, for want of matches with the others; let "
+                "their views overlap more (20 to 30 degrees between neighbors), or take --quality high."
+            )
+    return Opened(finish(with_cameras(capture, cameras), options, layout), True, normalization)
 
 
 @dataclass(frozen=True)
