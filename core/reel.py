@@ -3,24 +3,29 @@
 
 A reel is a JSON file `NAME.reel` that ties together payload files beside it (or in folders below it):
 
-    {"kind": "spacetime_gaussians", "version": 1, "fps": 24.0, "frame_start": 1, "frame_count": 50,
+    {"kind": "spacetime_gaussians", "version": 1, "fps": 24.0, "frame_start": 1, "frame_count": 100,
      "bounds": [[x, y, z], [x, y, z]], "up": "Z", "color_space": "display", "background": [0, 0, 0],
-     "decoder": null, "variant": "lite",
-     "segments": [{"file": "NAME.ply", "frame_start": 1, "frame_count": 50}],
+     "variant": "full", "decoder": {"output": "sigmoid", "viewpoint": [x, y, z]},
+     "segments": [{"file": "NAME.000.ply", "frame_start": 1, "frame_count": 50,
+                   "decoder": "NAME.000.decoder.safetensors"}, ...],
      "files": {"metrics": "metrics.json"}, "provenance": {...}}
 
-Segments follow each other without gap. Frame j of a segment's F frames has the normalized time j / F, in [0, 1).
+Segments follow each other without gap. Frame j of a segment's F frames has the normalized time j / F, in [0, 1). A lite
+reel has `decoder` null, and its segments have none.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath, PureWindowsPath
-from typing import Any, TypeGuard
+from typing import Any, NamedTuple, TypeGuard
+
+import numpy as np
 
 from .errors import HoloreelError
 from .files import read_json, write_json
+from .gaussians.decoder import ACTIVATIONS, Activation, Decoder, decoder_path, read_decoder, write_decoder
 from .gaussians.model import SpacetimeGaussians
-from .gaussians.ply import read_ply, write_ply
-from .gaussians.splatv import read_splatv
+from .gaussians.payload import PAYLOADS, find_decoder, read_payload, write_payload
 
 KIND = "spacetime_gaussians"
 VERSION = 1
@@ -29,15 +34,32 @@ COLOR_SPACES = ("display",)  # colors are sRGB as displayed: what was seen in th
 BARE_FRAME_COUNT = 50  # what the authors train on, and assumed where a file does not say
 BARE_FPS = 30.0
 
+SEGMENT_SUFFIXES = (".ply",)  # payloads that a segment may have
+_SUFFIX_WORDS = " or ".join(SEGMENT_SUFFIXES)
+_ENDINGS = ".reel, .ply or .splatv"
+
 Triple = tuple[float, float, float]
 Bounds = tuple[Triple, Triple]
 
 
 @dataclass(frozen=True)
 class Segment:
-    """A run of frames that one payload file holds; `file` is relative to the manifest, with forward slashes."""
+    """A run of frames that one payload file holds, and the file of its decoder if it has one.
+
+    Paths are relative to the manifest, with forward slashes.
+    """
 
     file: str
+    frame_start: int
+    frame_count: int
+    decoder: str | None = None
+
+
+class SegmentPayload(NamedTuple):
+    """What a segment is written from."""
+
+    gaussians: SpacetimeGaussians
+    decoder: Decoder | None
     frame_start: int
     frame_count: int
 
@@ -47,8 +69,10 @@ class Reel:
     """What a `.reel` manifest says.
 
     `bounds` is the box of the visible Gaussians' centers (lowest, highest corner), `up` the world axis that points up
-    (None where unknown), `background` the color the Gaussians were trained over. `files` names further files by purpose
-    (`config`, `metrics`, `log`); `provenance` is free.
+    (None where unknown), `background` the color the Gaussians were trained over. `decoder_output` is the activation
+    that the segments' decoders end in (None where there are none), `viewpoint` the place from which a full model's
+    colors are taken where only one for each Gaussian can be shown. `files` names further files by purpose (`config`,
+    `metrics`, `log`); `provenance` is free.
     """
 
     path: Path
@@ -61,6 +85,8 @@ class Reel:
     up: str | None = None
     color_space: str = "display"
     background: Triple = (0.0, 0.0, 0.0)
+    decoder_output: Activation | None = None
+    viewpoint: Triple | None = None
     files: dict[str, str] = field(default_factory=dict)
     provenance: dict[str, Any] = field(default_factory=dict)
 
@@ -77,13 +103,19 @@ class Reel:
         """Return the path of a segment's payload file."""
         return self.path.parent / self.segments[segment].file
 
+    def decoder(self, segment: int = 0) -> Path | None:
+        """Return the path of a segment's decoder, None where it has none."""
+        file = self.segments[segment].decoder
+        return None if file is None else self.path.parent / file
+
 
 @dataclass(frozen=True)
 class Loaded:
     """Spacetime Gaussians with what is needed to play them, whatever file they came from.
 
-    `kind` is `reel`, `ply` or `splatv`; `report` says in sentences what was assumed and what is unusual. Frame j of
-    `frame_count`, counted from `frame_start`, has the normalized time j / frame_count.
+    `kind` is `reel`, `ply` or `splatv`; `report` says in sentences what was assumed and what is unusual. Frame j
+    of `frame_count`, counted from `frame_start`, has the normalized time j / frame_count. A full model is drawn with
+    its `decoder`; where there is none, its base color stands for the color. `viewpoint` is as in `Reel`.
     """
 
     gaussians: SpacetimeGaussians
@@ -97,39 +129,44 @@ class Loaded:
     background: Triple
     report: list[str]
     reel: Reel | None = None
+    decoder: Decoder | None = None
+    viewpoint: Triple | None = None
 
     def time_of(self, frame: float) -> float:
         """Return the normalized time of a frame (sub-frames allowed)."""
         return (frame - self.frame_start) / self.frame_count
 
 
-def load_gaussians(path: str | Path, segment: int = 0) -> Loaded:
-    """Load a `.reel` (its `segment`-th payload), a `.ply` or a `.splatv`.
+def load_gaussians(path: str | Path, segment: int = 0, decoder_output: Activation | None = None) -> Loaded:
+    """Load a `.reel` (its `segment`-th payload), or a bare `.ply` or `.splatv`.
 
+    `decoder_output` is the activation of a bare full model whose `.pt` beside it does not say it (None: sigmoid).
     Raises `HoloreelError` for a missing, damaged or unknown file.
     """
     path = Path(path)
-    readers = {".ply": read_ply, ".splatv": read_splatv}
-    suffix = path.suffix.lower()
     if path.is_dir():
-        raise HoloreelError(f"{path} is a folder: give the .reel, .ply or .splatv file inside it.")
-    if suffix == ".reel":
+        raise HoloreelError(f"{path} is a folder: give the {_ENDINGS} file inside it.")
+    if path.suffix.lower() == ".reel":
+        if decoder_output is not None:
+            raise HoloreelError(f"{path} says itself what its decoder ends in: leave --decoder-output away.")
         return _load_reel(path, segment)
-    if suffix not in readers:
-        raise HoloreelError(f"{path} has the unknown ending '{path.suffix}': give a .reel, .ply or .splatv file.")
-    gaussians, report = readers[suffix](path)
+    if path.suffix.lower() not in PAYLOADS:
+        raise HoloreelError(f"{path} has the unknown ending '{path.suffix}': give a {_ENDINGS} file.")
+    gaussians, report = read_payload(path)
+    decoder, notes = find_decoder(path, gaussians, decoder_output)
     assumed = f"{path.name} does not say how long it is: {BARE_FRAME_COUNT} frames at {BARE_FPS:g} fps are assumed."
     return Loaded(
         gaussians,
         path,
-        kind=suffix[1:],
+        kind=path.suffix.lower()[1:],
         fps=BARE_FPS,
         frame_start=0,
         frame_count=BARE_FRAME_COUNT,
         up=None,
         color_space="display",
         background=(0.0, 0.0, 0.0),
-        report=[assumed, *report],
+        report=[assumed, *report, *notes],
+        decoder=decoder,
     )
 
 
@@ -140,12 +177,15 @@ def _load_reel(path: Path, index: int) -> Loaded:
     segment, payload = reel.segments[index], reel.payload(index)
     if not payload.is_file():
         raise HoloreelError(f"{path}: its payload '{segment.file}' is missing; put {payload} beside the reel.")
-    gaussians, report = read_ply(payload)
+    gaussians, report = read_payload(payload)
     if gaussians.variant != reel.variant:
         raise HoloreelError(
             f"{path} says 'variant' {reel.variant}, but '{segment.file}' is {gaussians.variant}: "
             "correct the variant, or put the right payload beside the reel."
         )
+    decoder = _load_decoder(reel, index)
+    if decoder is None and gaussians.variant == "full":
+        report.append(f"{path.name} is a full model without a decoder: the base color stands for the color.")
     return Loaded(
         gaussians,
         path,
@@ -158,7 +198,92 @@ def _load_reel(path: Path, index: int) -> Loaded:
         background=reel.background,
         report=report,
         reel=reel,
+        decoder=decoder,
+        viewpoint=reel.viewpoint,
     )
+
+
+def _load_decoder(reel: Reel, index: int) -> Decoder | None:
+    path, file = reel.decoder(index), reel.segments[index].decoder
+    if path is None:
+        return None
+    if not path.is_file():
+        raise HoloreelError(f"{reel.path}: its decoder '{file}' is missing; put {path} beside the reel.")
+    decoder = read_decoder(path)
+    if decoder.activation != reel.decoder_output:
+        raise HoloreelError(
+            f"{reel.path} says 'decoder.output' {reel.decoder_output}, but '{file}' says {decoder.activation}: "
+            "put the right decoder beside the reel."
+        )
+    return decoder
+
+
+def write_segments(
+    path: str | Path,
+    payloads: Sequence[SegmentPayload],
+    *,
+    fps: float,
+    frame_start: int,
+    up: str | None = None,
+    background: Triple = (0.0, 0.0, 0.0),
+    viewpoint: Triple | None = None,
+    files: dict[str, str] | None = None,
+    provenance: dict[str, Any] | None = None,
+    suffix: str = ".ply",
+) -> Reel:
+    """Write a reel of one or more segments, all lite, or all full with decoders of one activation (or none with any).
+
+    First the payloads, `NAME.ply` or, of several, `NAME.000.ply` and so on, and the decoders beside them; then the
+    manifest `NAME.reel` at `path`. Raises `HoloreelError` naming what does not
+    hold together.
+    """
+    path = Path(path)
+    stems = [path.stem] if len(payloads) == 1 else [f"{path.stem}.{index:03d}" for index in range(len(payloads))]
+    segments = tuple(
+        Segment(
+            stem + suffix,
+            part.frame_start,
+            part.frame_count,
+            decoder_path(Path(stem + suffix)).name if part.decoder else None,
+        )
+        for stem, part in zip(stems, payloads, strict=True)
+    )
+    boxes = [box for part in payloads if (box := part.gaussians.bounds()) is not None]
+    variants = sorted({part.gaussians.variant for part in payloads})
+    outputs = sorted({part.decoder.activation for part in payloads if part.decoder})
+    if len(variants) > 1 or len(outputs) > 1:
+        differences = ", ".join((*variants, *outputs))
+        raise HoloreelError(f"{path}: its segments differ ({differences}); train them all alike.")
+    reel = Reel(
+        path,
+        fps=float(fps),
+        frame_start=frame_start,
+        frame_count=sum(part.frame_count for part in payloads),
+        segments=segments,
+        variant="".join(variants),
+        bounds=_union(boxes),
+        up=up,
+        background=background,
+        decoder_output=outputs[0] if outputs else None,
+        viewpoint=viewpoint,
+        files=files or {},
+        provenance=provenance or {},
+    )
+    check_reel(reel)
+    for index, part in enumerate(payloads):
+        write_payload(reel.payload(index), part.gaussians)
+        decoder = reel.decoder(index)
+        if part.decoder and decoder:
+            write_decoder(decoder, part.decoder)
+    write_reel(reel)
+    return reel
+
+
+def _union(boxes: list[np.ndarray]) -> Bounds | None:
+    if not boxes:
+        return None
+    low, high = np.min([box[0] for box in boxes], axis=0), np.max([box[1] for box in boxes], axis=0)
+    return tuple(low.tolist()), tuple(high.tolist())
 
 
 def save_gaussians(
@@ -168,31 +293,25 @@ def save_gaussians(
     fps: float,
     frame_start: int,
     frame_count: int,
+    decoder: Decoder | None = None,
     up: str | None = None,
     background: Triple = (0.0, 0.0, 0.0),
+    viewpoint: Triple | None = None,
     files: dict[str, str] | None = None,
     provenance: dict[str, Any] | None = None,
 ) -> Reel:
-    """Write `gaussians` as a reel of one segment: the payload `NAME.ply`, then the manifest `NAME.reel` at `path`."""
-    path = Path(path)
-    box = gaussians.bounds()
-    reel = Reel(
+    """Write `gaussians` as a reel of one segment: `NAME.ply` (and its decoder), then the manifest `NAME.reel`."""
+    return write_segments(
         path,
-        fps=float(fps),
+        [SegmentPayload(gaussians, decoder, frame_start, frame_count)],
+        fps=fps,
         frame_start=frame_start,
-        frame_count=frame_count,
-        segments=(Segment(f"{path.stem}.ply", frame_start, frame_count),),
-        variant=gaussians.variant,
-        bounds=None if box is None else _parse_bounds(path, box.tolist()),
         up=up,
         background=background,
-        files=files or {},
-        provenance=provenance or {},
+        viewpoint=viewpoint,
+        files=files,
+        provenance=provenance,
     )
-    check_reel(reel)
-    write_ply(reel.payload(), gaussians)
-    write_reel(reel)
-    return reel
 
 
 def write_reel(reel: Reel) -> None:
@@ -208,13 +327,19 @@ def write_reel(reel: Reel) -> None:
         "up": reel.up,
         "color_space": reel.color_space,
         "background": reel.background,
-        "decoder": None,
         "variant": reel.variant,
-        "segments": [vars(segment) for segment in reel.segments],
+        "decoder": _decoder_json(reel),
+        "segments": [{k: v for k, v in vars(part).items() if v is not None} for part in reel.segments],
         "files": reel.files,
         "provenance": reel.provenance,
     }
     write_json(reel.path, manifest)
+
+
+def _decoder_json(reel: Reel) -> dict[str, Any] | None:
+    if reel.decoder_output is None:
+        return None
+    return {"output": reel.decoder_output} | ({"viewpoint": reel.viewpoint} if reel.viewpoint else {})
 
 
 def read_reel(path: str | Path) -> Reel:
@@ -230,8 +355,13 @@ def read_reel(path: str | Path) -> Reel:
         raise HoloreelError(
             f"{path} is a reel of version {version}, this Holoreel reads up to {VERSION}: update Holoreel."
         )
-    if manifest.get("decoder") is not None:
-        raise HoloreelError(f"{path}: 'decoder' is set, and this Holoreel draws reels without one: update Holoreel.")
+    decoder = manifest.get("decoder") or {}
+    if not isinstance(decoder, dict) or (decoder and decoder.get("output") not in ACTIVATIONS):
+        raise HoloreelError(
+            f"{path}: 'decoder' is {decoder!r}, not null or an object with 'output' {', '.join(ACTIVATIONS)}; "
+            "correct it or write the reel again."
+        )
+    viewpoint = decoder.get("viewpoint")
     segments = manifest.get("segments")
     if not isinstance(segments, list) or not all(isinstance(segment, dict) for segment in segments):
         raise HoloreelError(f"{path}: 'segments' is not a list of objects; write the reel again.")
@@ -246,6 +376,8 @@ def read_reel(path: str | Path) -> Reel:
         up=manifest.get("up"),
         color_space=manifest.get("color_space", ""),
         background=_parse_triple(path, "background", manifest.get("background", (0.0, 0.0, 0.0))),
+        decoder_output=decoder.get("output"),
+        viewpoint=None if viewpoint is None else _parse_triple(path, "decoder.viewpoint", viewpoint),
         files=manifest.get("files", {}),
         provenance=manifest.get("provenance", {}),
     )
@@ -270,6 +402,7 @@ def check_reel(reel: Reel) -> None:
         _is_int(reel.frame_count) and reel.frame_count > 0, "frame_count", reel.frame_count, "a positive whole number"
     )
     demand(reel.variant in ("lite", "full"), "variant", reel.variant, "'lite' or 'full'")
+    demand(reel.variant == "full" or reel.decoder_output is None, "decoder", reel.decoder_output, "null in a lite reel")
     demand(reel.up is None or reel.up in UP_AXES, "up", reel.up, f"null or one of {', '.join(UP_AXES)}")
     demand(reel.color_space in COLOR_SPACES, "color_space", reel.color_space, f"one of {', '.join(COLOR_SPACES)}")
     demand(isinstance(reel.provenance, dict), "provenance", reel.provenance, "an object")
@@ -281,7 +414,14 @@ def check_reel(reel: Reel) -> None:
     for index, segment in enumerate(reel.segments):
         at = f"segments[{index}]"
         demand(_is_safe(segment.file), f"{at}.file", segment.file, "a relative path below the reel")
-        demand(segment.file.endswith(".ply"), f"{at}.file", segment.file, "a .ply file")
+        demand(segment.file.endswith(SEGMENT_SUFFIXES), f"{at}.file", segment.file, f"a {_SUFFIX_WORDS} file")
+        if reel.decoder_output is None:
+            demand(segment.decoder is None, f"{at}.decoder", segment.decoder, "null, as 'decoder' of the reel is")
+        else:
+            demand(_is_safe(segment.decoder), f"{at}.decoder", segment.decoder, "a relative path below the reel")
+            demand(
+                str(segment.decoder).endswith(".safetensors"), f"{at}.decoder", segment.decoder, "a .safetensors file"
+            )
         count = segment.frame_count
         demand(_is_int(count) and count > 0, f"{at}.frame_count", count, "a positive whole number")
         start = segment.frame_start

@@ -6,7 +6,7 @@ One element `vertex`, all properties `float`, in this order (lite: 32 floats, fu
 
     x y z, trbf_center, trbf_scale, nx ny nz (zeros), motion_0..8 (linear, quadratic, cubic xyz),
     f_dc_0..2 (lite) or f_dc_0..5 (full: base, direction), opacity, scale_0..2, rot_0..3 (w x y z), omega_0..3,
-    f_t_0..2 (full only)
+    f_t_0..2 (full only; the network that goes with it lies in a file of its own, see `decoder`)
 
 Ordinary 3D Gaussian Splatting files (`f_dc`, `opacity`, `scale`, `rot` without motion) are read as well: as Gaussians
 that stand still and are always visible, colored by the constant band of their harmonics.
@@ -62,12 +62,7 @@ def read_ply(path: str | Path) -> tuple[SpacetimeGaussians, list[str]]:
     names = set(table.dtype.names or ())
     report: list[str] = []
     if {"trbf_center", "trbf_scale"} & names:
-        variant = "full" if {"f_t_0", "f_dc_3"} & names else "lite"
-        gaussians = _spacetime(path, table, variant)
-        if variant == "full":
-            report.append(
-                f"{path.name} is a full model: its decoder network is not applied, the base color stands for the color."
-            )
+        gaussians = _spacetime(path, table, "full" if {"f_t_0", "f_dc_3"} & names else "lite")
     elif "f_dc_0" in names:
         gaussians = _static(path, table)
         report.append(

@@ -7,9 +7,18 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from holoreel.core.errors import HoloreelError
+from holoreel.core.gaussians.decoder import Decoder, write_decoder
 from holoreel.core.gaussians.model import ROWS
 from holoreel.core.gaussians.ply import write_ply
-from holoreel.core.reel import Segment, load_gaussians, read_reel, save_gaussians, write_reel
+from holoreel.core.reel import (
+    Segment,
+    SegmentPayload,
+    load_gaussians,
+    read_reel,
+    save_gaussians,
+    write_reel,
+    write_segments,
+)
 
 
 @pytest.fixture
@@ -79,7 +88,8 @@ def test_bare_files_have_assumed_lengths(tmp_path, random_model):
         ("variant", KeyError), ("bounds", [1, 2]), ("bounds", [[0, 0, 0], [1, 1, -1]]), ("bounds", 7),
         ("bounds", [["a"] * 3] * 2), ("bounds", [[0, 0, float("nan")], [1, 1, 1]]), ("up", "W"), ("up", ["Z"]),
         ("color_space", "acescg"), ("color_space", KeyError), ("background", [0, 1]), ("background", None),
-        ("background", "red"), ("decoder", {"file": "a.pt"}), ("files", []),
+        ("background", "red"), ("decoder", {"file": "a.pt"}), ("decoder", {"output": "tanh"}), ("decoder", "sigmoid"),
+        ("decoder", {"output": "sigmoid"}), ("segments__0__decoder", "a.decoder.safetensors"), ("files", []),
         ("files", {"metrics": "../m.json"}), ("provenance", 3), ("segments", []), ("segments", {}),
         ("segments", ["a.ply"]), ("segments", None), ("segments__0__file", "/etc/a.ply"),
         ("segments__0__file", "../a.ply"), ("segments__0__file", "b/../../a.ply"), ("segments__0__file", "..\\a.ply"),
@@ -138,3 +148,54 @@ def test_nothing_half_written(tmp_path, random_model):
     (tmp_path / "file").write_text("")
     with pytest.raises(HoloreelError, match="cannot be written"):
         save_gaussians(tmp_path / "file" / "a.reel", random_model(3), fps=24, frame_start=0, frame_count=5)
+
+
+@pytest.fixture
+def decoders():
+    random = np.random.default_rng(4)
+    return [Decoder(random.normal(size=(6, 12)), random.normal(size=(3, 6)), "clamp") for _ in range(2)]
+
+
+def test_segments_of_a_full_model_each_have_their_decoder(tmp_path, random_model, decoders):
+    models = [random_model(20, seed, features=9) for seed in (1, 2)]
+    parts = [SegmentPayload(*both, 11 + 4 * i, 4) for i, both in enumerate(zip(models, decoders, strict=True))]
+    reel = write_segments(tmp_path / "a.reel", parts, fps=25, frame_start=11, viewpoint=(1.0, 2.0, 3.0))
+    assert read_reel(reel.path) == reel
+    assert sorted(path.name for path in tmp_path.iterdir()) == [
+        "a.000.decoder.safetensors", "a.000.ply", "a.001.decoder.safetensors", "a.001.ply", "a.reel",
+    ]  # fmt: skip
+    assert json.loads(reel.path.read_text())["decoder"] == {"output": "clamp", "viewpoint": [1.0, 2.0, 3.0]}
+    assert (reel.frame_count, reel.locate(15), reel.locate(14)) == (8, (1, 0.0), (0, 0.75))
+    for index, (model, decoder) in enumerate(zip(models, decoders, strict=True)):
+        loaded = load_gaussians(reel.path, index)
+        np.testing.assert_array_equal(loaded.gaussians.features, model.features)
+        np.testing.assert_array_equal(loaded.decoder.hidden, decoder.hidden)
+        assert (loaded.decoder.activation, loaded.viewpoint, loaded.report) == ("clamp", (1.0, 2.0, 3.0), [])
+    boxes = np.array([model.bounds() for model in models])
+    np.testing.assert_allclose(reel.bounds, [boxes[:, 0].min(axis=0), boxes[:, 1].max(axis=0)])
+    write_decoder(reel.decoder(1), Decoder(decoders[0].hidden, decoders[0].output, "none"))
+    with pytest.raises(HoloreelError, match=r"'decoder.output' clamp, but 'a\.001\.decoder\.safetensors' says none"):
+        load_gaussians(reel.path, 1)
+    reel.decoder(0).unlink()
+    with pytest.raises(HoloreelError, match=r"its decoder 'a\.000\.decoder\.safetensors' is missing"):
+        load_gaussians(reel.path)
+    with pytest.raises(HoloreelError, match="leave --decoder-output away"):
+        load_gaussians(reel.path, decoder_output="clamp")
+
+
+def test_segments_must_hold_together(tmp_path, random_model, decoders):
+    lite, full = random_model(5), random_model(5, features=9)
+    other = Decoder(decoders[0].hidden, decoders[0].output, "none")
+    cases = [
+        ([(lite, None, 1, 4), (lite, None, 6, 4)], "'segments.1..frame_start' is 6, not 5"),
+        ([(lite, None, 2, 4)], "'segments.0..frame_start' is 2, not 1"),
+        ([(lite, None, 1, 4), (full, None, 5, 4)], "differ .full, lite"),
+        ([(full, other, 1, 4), (full, decoders[1], 5, 4)], "differ .full, clamp, none"),
+        ([(full, other, 1, 4), (full, None, 5, 4)], "'segments.1..decoder' is None"),
+        ([(lite, other, 1, 4)], "'decoder' is 'none', not null in a lite reel"),
+        ([], "'variant' is ''"),
+    ]
+    for parts, words in cases:
+        with pytest.raises(HoloreelError, match=words):
+            write_segments(tmp_path / "a.reel", [SegmentPayload(*part) for part in parts], fps=25, frame_start=1)
+        assert list(tmp_path.iterdir()) == []
