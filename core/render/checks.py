@@ -1,11 +1,14 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Shapes and types of what the backends are given, so that a mistake is named before memory is touched."""
 
+import math
+from collections.abc import Sequence
+
 import torch
 from torch import Tensor
 
 from ..camera import Camera
-from .contract import ACTIVATIONS, DensityStats, SpacetimeTensors
+from .contract import ACTIVATIONS, AdamGroup, DensityStats, SpacetimeTensors
 
 MAX_CHANNELS = 16
 
@@ -47,10 +50,28 @@ def check_spacetime(gaussians: SpacetimeTensors, background: Tensor | None, dens
 
 
 def check_images(image: Tensor, target: Tensor) -> None:
-    """Raise ValueError unless both are (H, W, C), of one size and not empty."""
+    """Raise ValueError unless both are (H, W, C), of one size and not empty; the target may be of bytes."""
     if image.ndim != 3 or image.numel() == 0:
         raise ValueError(f"image has shape {tuple(image.shape)}, not (H, W, C)")
     _check_shapes(target=(target, tuple(image.shape)))
+    if not target.dtype.is_floating_point and target.dtype != torch.uint8:
+        raise ValueError(f"target is of {target.dtype}, not of floats or torch.uint8")
+
+
+def check_adam(groups: Sequence[AdamGroup], step: int) -> None:
+    """Raise ValueError unless the arguments of `adam` are as the contract says."""
+    if step < 1:
+        raise ValueError("adam counts steps from 1")
+    for group in groups:
+        value = group.value
+        for name in ("value", "gradient", "mean", "mean_square"):
+            tensor: Tensor = getattr(group, name)
+            if tensor.shape != value.shape or tensor.dtype != torch.float32 or not tensor.is_contiguous():
+                raise ValueError(f"adam: {name} must be contiguous, float32 and of shape {tuple(value.shape)}")
+        if group.row_rates is not None:
+            _check_shapes(row_rates=(group.row_rates, tuple(value.shape[:1])))
+        if group.column_rates is not None:
+            _check_shapes(column_rates=(group.column_rates, (math.prod(value.shape[1:]),)))
 
 
 def check_decoder(features: Tensor, camera: Camera, hidden: Tensor, output: Tensor, activation: str) -> None:

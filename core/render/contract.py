@@ -17,6 +17,18 @@ are differentiable with respect to every tensor argument.
         activation(base + output · relu(hidden · [direction, time, ray origin, ray direction])), with the ray through
         the pixel's center in the world and its direction of unit length. `clamp` passes no gradient outside [0, 1].
 
+What training needs beside them:
+
+    picture_loss(image, target, weight_dssim) -> PictureLoss
+        (1 - w) mean|image - target| + w (1 - mean SSIM) of two (H,W,C) images, and their mean squared error. The target
+        holds values, or bytes (uint8) that stand for 255ths. SSIM has an 11 x 11 Gaussian window of sigma 1.5, zeros
+        beyond the border, C1 = 0.01² and C2 = 0.03². At equal values the gradient of the first term is 0.
+    l1_dssim(image, target, weight_dssim) -> Tensor
+        The loss alone.
+    adam(groups: Sequence[AdamGroup], beta1, beta2, eps, step) -> None
+        One step of Adam for every tensor of a model in one pass, in place, as `torch.optim.Adam` does; `step` counts
+        from 1.
+
 `camera` is a `holoreel.core.camera.Camera` (PINHOLE); `background` a (C,) tensor or None for black; `rules` None for
 `Rules()`. C is 1 to 16.
 
@@ -26,6 +38,7 @@ always on), where the opacity at `time` is under `alpha_min`, or where its 2D co
 quaternion means no rotation. Renderings are float32, or for `reference` of the dtype of the means.
 """
 
+import math
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -91,3 +104,29 @@ class DensityStats:
     gradient: Tensor
     views: Tensor
     radius_px: Tensor
+
+
+class PictureLoss(NamedTuple):
+    """What one picture costs: `loss`, a scalar to be differentiated, and the mean `squared_error`."""
+
+    loss: Tensor
+    squared_error: float
+
+
+class AdamGroup(NamedTuple):
+    """One tensor of any shape for `adam`, with its gradient and its two moments, all alike.
+
+    The step size is `rate`, times a factor for each row of the first dimension (`row_rates`, (N,)) and one for each
+    value within a row (`column_rates`, as many as a row has values, in their order). Afterwards values are held in
+    [`low`, `high`]. What a picture did not see is stepped too, as in `torch.optim.Adam`.
+    """
+
+    value: Tensor
+    gradient: Tensor
+    mean: Tensor
+    mean_square: Tensor
+    rate: float
+    row_rates: Tensor | None = None
+    column_rates: Tensor | None = None
+    low: float = -math.inf
+    high: float = math.inf

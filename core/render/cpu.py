@@ -2,6 +2,8 @@
 """The `cpu` backend: the compiled kernels as differentiable torch functions. `contract` says what they compute."""
 
 import ctypes
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -11,11 +13,12 @@ from torch.autograd.function import once_differentiable
 
 from ..camera import Camera
 from ..errors import HoloreelError
-from .checks import check_decoder, check_gaussians, check_images, check_pinhole, check_spacetime
-from .contract import ACTIVATIONS, DensityStats, Rendering, Rules, SpacetimeTensors
+from .checks import check_adam, check_decoder, check_gaussians, check_images, check_pinhole, check_spacetime
+from .contract import ACTIVATIONS, AdamGroup, DensityStats, PictureLoss, Rendering, Rules, SpacetimeTensors
 from .native import (
     PARAMETERS,
     TIMINGS,
+    CAdamGroup,
     CCamera,
     CDecoder,
     CGaussians,
@@ -31,11 +34,13 @@ from .native import (
 )
 
 __all__ = [
+    "adam",
     "adam_step",
     "decode",
     "get_threads",
     "l1_dssim",
     "load_kernels",
+    "picture_loss",
     "rasterize",
     "rasterize_spacetime",
     "set_lanes",
@@ -223,34 +228,62 @@ class _Decode(torch.autograd.Function):
         return d_features, None, d_hidden, d_output, None
 
 
-def l1_dssim(image: Tensor, target: Tensor, weight_dssim: float) -> Tensor:
-    """Return (1 - w) mean|image - target| + w (1 - mean SSIM) of two (H, W, C) images, a scalar.
-
-    SSIM has an 11 x 11 Gaussian window of sigma 1.5, zeros beyond the border, C1 = 0.01² and C2 = 0.03². Differentiable
-    with respect to `image`; at equal values the gradient of L1 is 0.
-    """
+def picture_loss(image: Tensor, target: Tensor, weight_dssim: float) -> PictureLoss:
+    """Return the training loss and the mean squared error of two images, as in `contract`, in float32."""
     check_images(image, target)
-    return _L1Dssim.apply(_plain(image), _plain(target), float(weight_dssim))
+    target = target.contiguous() if target.dtype == torch.uint8 else _plain(target)
+    loss, squared_error = _PictureLoss.apply(_plain(image), target, float(weight_dssim))
+    return PictureLoss(loss, squared_error)
 
 
-class _L1Dssim(torch.autograd.Function):
+def l1_dssim(image: Tensor, target: Tensor, weight_dssim: float) -> Tensor:
+    """Return the training loss of two images alone."""
+    return picture_loss(image, target, weight_dssim).loss
+
+
+class _PictureLoss(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, image: Tensor, target: Tensor, weight: float) -> Tensor:
+    def forward(ctx: Any, image: Tensor, target: Tensor, weight: float) -> tuple[Tensor, float]:
         # The gradient comes almost for free with the value, so it is taken at once.
         gradient = torch.empty_like(image) if ctx.needs_input_grad[0] else None
-        loss = ctypes.c_double()
+        loss, squared_error = ctypes.c_double(), ctypes.c_double()
         library = load_kernels()
-        height, width, channels = image.shape
-        pointers = _address(image), _address(target)
-        if library.holoreel_l1_dssim(*pointers, height, width, channels, weight, loss, _address(gradient)) != 0:
+        targets = (None, _address(target)) if target.dtype == torch.uint8 else (_address(target), None)
+        status = library.holoreel_l1_dssim(
+            _address(image), *targets, *image.shape, weight, loss, squared_error, _address(gradient)
+        )
+        if status != 0:
             raise HoloreelError(f"The loss cannot be computed: {library.holoreel_last_error().decode()}.")
         ctx.gradient = gradient
-        return torch.tensor(loss.value, dtype=torch.float32)
+        return torch.tensor(loss.value, dtype=torch.float32), squared_error.value
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, None, None]:
-        return (None if ctx.gradient is None else ctx.gradient * gradient), None, None
+    def backward(ctx: Any, gradient: Tensor, _: object) -> tuple[Tensor | None, None, None]:
+        if ctx.gradient is None:
+            return None, None, None
+        return (ctx.gradient if float(gradient) == 1.0 else ctx.gradient * gradient), None, None
+
+
+def adam(groups: Sequence[AdamGroup], beta1: float, beta2: float, eps: float, step: int) -> None:
+    """Take one step of Adam, in place, as in `contract`."""
+    check_adam(groups, step)
+    kept = [(_plain(group.row_rates), _plain(group.column_rates)) for group in groups]  # alive during the call
+    array = (CAdamGroup * len(groups))(
+        *(
+            CAdamGroup(
+                *map(_address, group[:4]),
+                *map(_address, rates),
+                len(group.value),
+                math.prod(group.value.shape[1:]),
+                group.rate,
+                group.low,
+                group.high,
+            )
+            for group, rates in zip(groups, kept, strict=True)
+        )
+    )
+    load_kernels().holoreel_adam_step(array, len(groups), beta1, beta2, eps, step)
 
 
 def adam_step(
@@ -264,14 +297,5 @@ def adam_step(
     eps: float,
     step: int,
 ) -> None:
-    """Take one step of Adam, in place, as `torch.optim.Adam` does. `step` counts from 1.
-
-    All four tensors are float32, contiguous and of one shape.
-    """
-    tensors = (param, grad, exp_avg, exp_avg_sq)
-    for tensor in tensors:
-        if tensor.shape != param.shape or tensor.dtype != torch.float32 or not tensor.is_contiguous():
-            raise ValueError("adam_step needs contiguous float32 tensors of one shape")
-    if step < 1:
-        raise ValueError("adam_step counts steps from 1")
-    load_kernels().holoreel_adam_step(*map(_address, tensors), param.numel(), lr, beta1, beta2, eps, step)
+    """Take one step of Adam with one tensor."""
+    adam([AdamGroup(param, grad, exp_avg, exp_avg_sq, lr)], beta1, beta2, eps, step)

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from ..errors import HoloreelError
 
-ABI = 5  # HOLOREEL_ABI in kernels/api.hpp
+ABI = 6  # HOLOREEL_ABI in kernels/api.hpp
 
 
 class CCamera(Structure):
@@ -89,6 +89,16 @@ class CDecoder(Structure):
     _fields_ = (("hidden", c_void_p), ("output", c_void_p), ("activation", c_int32), ("unused", c_int32))
 
 
+class CAdamGroup(Structure):
+    """`HoloreelAdamGroup`."""
+
+    _fields_ = (
+        *((n, c_void_p) for n in ("values", "gradient", "mean", "mean_square", "row_rates", "column_rates")),
+        *((name, c_int64) for name in ("rows", "columns")),
+        *((name, c_double) for name in ("rate", "low", "high")),
+    )
+
+
 TIMINGS = ("project", "sort", "bin", "blend", "backward_blend", "backward_gather")
 
 
@@ -119,11 +129,11 @@ _SIGNATURES = {
     ),
     "holoreel_l1_dssim": (
         c_int,
-        (c_void_p, c_void_p, c_int, c_int, c_int, c_double, POINTER(c_double), c_void_p),
+        (*[c_void_p] * 3, *[c_int] * 3, c_double, POINTER(c_double), POINTER(c_double), c_void_p),
     ),
     "holoreel_decode": (c_int, (POINTER(CCamera), POINTER(CDecoder), c_void_p, c_void_p)),
     "holoreel_decode_backward": (c_int, (POINTER(CCamera), POINTER(CDecoder), *[c_void_p] * 5)),
-    "holoreel_adam_step": (c_int, (*[c_void_p] * 4, c_int64, *[c_double] * 4, c_int64)),
+    "holoreel_adam_step": (c_int, (POINTER(CAdamGroup), c_int64, *[c_double] * 3, c_int64)),
     "holoreel_frame_free": (None, (c_void_p,)),
     "holoreel_frame_intersections": (c_int64, (c_void_p,)),
     "holoreel_frame_visible": (c_int64, (c_void_p,)),

@@ -6,7 +6,7 @@ tiles are taken in groups of about equal length, padded, and composited by a cum
 """
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -15,8 +15,8 @@ from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
 from ..camera import Camera
-from .checks import check_decoder, check_gaussians, check_images, check_pinhole, check_spacetime
-from .contract import DensityStats, Rendering, Rules, SpacetimeTensors
+from .checks import check_adam, check_decoder, check_gaussians, check_images, check_pinhole, check_spacetime
+from .contract import AdamGroup, DensityStats, PictureLoss, Rendering, Rules, SpacetimeTensors
 
 TILE = 16
 GROUP_ELEMENTS = 3_000_000  # of (Gaussian, pixel) pairs composited at once
@@ -329,11 +329,35 @@ def ssim_map(image: Tensor, target: Tensor) -> Tensor:
     return (2 * x * y + c1) * (2 * xy + c2) / ((x * x + y * y + c1) * (xx + yy + c2))
 
 
-def l1_dssim(image: Tensor, target: Tensor, weight_dssim: float) -> Tensor:
-    """Return (1 - w) mean|image - target| + w (1 - mean SSIM) of two (H, W, C) images, as `cpu.l1_dssim` does."""
+def picture_loss(image: Tensor, target: Tensor, weight_dssim: float) -> PictureLoss:
+    """Return the training loss and the mean squared error of two images, as in `contract`."""
     check_images(image, target)
-    difference = (image - target).abs().mean()
-    return (1 - weight_dssim) * difference + weight_dssim * (1 - ssim_map(image, target).mean())
+    target = target.to(image.dtype) / 255 if target.dtype == torch.uint8 else target
+    difference = image - target
+    loss = (1 - weight_dssim) * difference.abs().mean() + weight_dssim * (1 - ssim_map(image, target).mean())
+    return PictureLoss(loss, float(difference.detach().square().mean()))
+
+
+def l1_dssim(image: Tensor, target: Tensor, weight_dssim: float) -> Tensor:
+    """Return the training loss of two images alone."""
+    return picture_loss(image, target, weight_dssim).loss
+
+
+def adam(groups: Sequence[AdamGroup], beta1: float, beta2: float, eps: float, step: int) -> None:
+    """Take one step of Adam, in place, as in `contract`."""
+    check_adam(groups, step)
+    with torch.no_grad():
+        for group in groups:
+            value, gradient = group.value, group.gradient
+            group.mean.mul_(beta1).add_(gradient, alpha=1 - beta1)
+            group.mean_square.mul_(beta2).addcmul_(gradient, gradient, value=1 - beta2)
+            spread = group.mean_square.sqrt().div_(math.sqrt(1 - beta2**step)).add_(eps)
+            move = (group.mean / spread).mul_(group.rate / (1 - beta1**step))
+            if group.row_rates is not None:
+                move *= group.row_rates.reshape(-1, *[1] * (value.ndim - 1))
+            if group.column_rates is not None:
+                move *= group.column_rates.reshape(value.shape[1:])
+            value.sub_(move).clamp_(group.low, group.high)
 
 
 def adam_step(
@@ -347,9 +371,5 @@ def adam_step(
     eps: float,
     step: int,
 ) -> None:
-    """Take one step of Adam, in place, as `torch.optim.Adam` does. `step` counts from 1."""
-    with torch.no_grad():
-        exp_avg.mul_(beta1).add_(grad, alpha=1 - beta1)
-        exp_avg_sq.mul_(beta2).addcmul_(grad, grad, value=1 - beta2)
-        spread = exp_avg_sq.sqrt().div_(math.sqrt(1 - beta2**step)).add_(eps)
-        param.addcdiv_(exp_avg, spread, value=-lr / (1 - beta1**step))
+    """Take one step of Adam with one tensor."""
+    adam([AdamGroup(param, grad, exp_avg, exp_avg_sq, lr)], beta1, beta2, eps, step)

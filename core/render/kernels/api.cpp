@@ -223,22 +223,24 @@ HOLOREEL_API void holoreel_frame_timings(const void* frame, HoloreelTimings* out
     *out = static_cast<const Frame*>(frame)->timings;
 }
 
-// Returns 0, or -1 with an error text; writes the loss, and its gradient with respect to `image` where that is not null.
-HOLOREEL_API int holoreel_l1_dssim(const float* image, const float* target, int height, int width, int channels,
-                                   double weight, double* loss, float* gradient) {
+// Returns 0, or -1 with an error text. The target is values, or bytes that stand for 255ths; the other is null. Writes the
+// loss, the mean squared error, and the gradient of the loss with respect to `image` where that is not null.
+HOLOREEL_API int holoreel_l1_dssim(const float* image, const float* target, const uint8_t* target_bytes, int height,
+                                   int width, int channels, double weight, double* loss, double* squared_error,
+                                   float* gradient) {
     const bool good = guarded([&] {
         if (height < 1 || width < 1 || channels < 1 || static_cast<int64_t>(width) * channels > INT32_MAX / 2)
             throw std::invalid_argument("the image is empty or too wide");
-        *loss = l1_dssim(image, target, height, width, channels, weight, gradient);
+        const Loss result = l1_dssim(image, {target, target_bytes}, height, width, channels, weight, gradient);
+        *loss = result.value;
+        *squared_error = result.squared_error;
     });
     return good ? 0 : -1;
 }
 
-HOLOREEL_API int holoreel_adam_step(float* values, const float* gradient, float* mean, float* mean_square,
-                                    int64_t count, double rate, double beta1, double beta2, double epsilon,
-                                    int64_t step) {
-    const bool good = guarded(
-        [&] { adam_step(values, gradient, mean, mean_square, count, rate, beta1, beta2, epsilon, step); });
+HOLOREEL_API int holoreel_adam_step(const HoloreelAdamGroup* groups, int64_t count, double beta1, double beta2,
+                                    double epsilon, int64_t step) {
+    const bool good = guarded([&] { adam_step(groups, count, beta1, beta2, epsilon, step); });
     return good ? 0 : -1;
 }
 

@@ -4,7 +4,7 @@
 
 #include <cstdint>
 
-#define HOLOREEL_ABI 5
+#define HOLOREEL_ABI 6
 #define HOLOREEL_API extern "C" __attribute__((visibility("default")))
 
 struct HoloreelCamera {
@@ -56,6 +56,17 @@ struct HoloreelDecoder {
     const float *hidden, *output;
     int32_t activation;
     int32_t unused;
+};
+
+// One tensor for Adam: rows of `columns` values. The step size is rate times the row's and the column's factor (null: 1);
+// values are held in [low, high].
+struct HoloreelAdamGroup {
+    float* values;
+    const float* gradient;
+    float *mean, *mean_square;
+    const float *row_rates, *column_rates;
+    int64_t rows, columns;
+    double rate, low, high;
 };
 
 struct HoloreelTimings {  // seconds

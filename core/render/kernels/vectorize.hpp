@@ -10,8 +10,9 @@
 #define HOLOREEL_CLONES
 #endif
 
-// For work in double precision on one Gaussian after another, with everything it calls put inside (GCC only).
-#if defined(__x86_64__) && defined(__gnu_linux__) && !defined(__clang__)
+// For heavier arithmetic, with everything it calls put inside (GCC only). Products and sums may be fused, so copies differ in
+// the last bits.
+#if defined(__x86_64__) && defined(__gnu_linux__) && !defined(__clang__) && __GNUC__ >= 12
 #define HOLOREEL_HEAVY_CLONES __attribute__((target_clones("arch=x86-64-v3", "default"), flatten))
 #else
 #define HOLOREEL_HEAVY_CLONES
