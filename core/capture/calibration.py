@@ -44,11 +44,11 @@ def read_calibration(file: Path) -> list[Calibrated]:
     entries = _entries(file)
     if not 1 <= len(entries) <= _MAX_CAMERAS:
         raise HoloreelError(f"{file} describes no cameras; export the calibration again.")
-    return [_calibrated(file, label, entry) for label, entry in entries.items()]
+    return [_calibrated(file, label, entry) for label, entry in entries]
 
 
-def _entries(file: Path) -> dict[str, dict[str, Any]]:
-    """The cameras of a file by label; those that it says to ignore are left out."""
+def _entries(file: Path) -> list[tuple[str, dict[str, Any]]]:
+    """The cameras of a file with their labels; those that it says to ignore are left out."""
     try:
         if file.stat().st_size > _MAX_BYTES:
             raise HoloreelError(f"{file} is larger than {_MAX_BYTES >> 20} MiB: this is no calibration.")
@@ -59,12 +59,13 @@ def _entries(file: Path) -> dict[str, dict[str, Any]]:
     except (ValueError, RecursionError) as error:
         raise HoloreelError(f"{file} is damaged ({error}): export the calibration again.") from error
     cameras = value.get("cameras", value) if isinstance(value, dict) else value
-    if isinstance(cameras, list):
-        cameras = {str(entry.get("name", index)) if isinstance(entry, dict) else str(index): entry
-                   for index, entry in enumerate(cameras)}  # fmt: skip
-    if not isinstance(cameras, dict):
+    if isinstance(cameras, dict):
+        labeled = list(cameras.items())
+    elif isinstance(cameras, list):
+        labeled = [(str(e.get("name", i)) if isinstance(e, dict) else str(i), e) for i, e in enumerate(cameras)]
+    else:
         raise HoloreelError(f"{file}: cameras must be a list or a table; export the calibration again.")
-    return {label: entry for label, entry in cameras.items() if isinstance(entry, dict) and not entry.get("ignore")}
+    return [(label, entry) for label, entry in labeled if isinstance(entry, dict) and not entry.get("ignore")]
 
 
 def _calibrated(file: Path, label: str, entry: dict[str, Any]) -> Calibrated:

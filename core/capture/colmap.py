@@ -90,7 +90,8 @@ def write(capture: Capture, path: Path, export: Export) -> None:
     def place(name: str, frame: int) -> Path:
         return folders[frame] / "images" / files[name]
 
-    write_pictures(capture, dict(capture.cameras), place, export, alpha=True)
-    cameras = {files[name]: capture.cameras[name] for name in files}
+    lenses = export.lenses(capture)
+    write_pictures(capture, lenses, place, export, alpha=True)
+    cameras = {files[name]: lenses[name] for name in files}
     for j, folder in enumerate(folders):
         write_model(folder / "sparse" / "0", cameras, capture.seed_points(j))

@@ -6,7 +6,7 @@ A file that exists already is taken for written (each appears only when it is wh
 
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from fractions import Fraction
 from pathlib import Path
 
@@ -30,12 +30,25 @@ class Export:
 
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)  # behind transparent pictures, where a layout has no alpha
     on_progress: Callable[[int, int], None] | None = None  # pictures done, and all
+    rectify: float | None = None  # make pinholes of lenses with distortion, with this share of their focal length
     notes: list[str] = field(default_factory=list)  # sentences about what the layout could not hold
+
+    def lenses(self, capture: Capture) -> dict[str, Camera]:
+        """Return the cameras to write, by name: those of `capture`, rectified where that is asked for."""
+        return {
+            name: camera if self.rectify is None or camera.model == "PINHOLE" else pinhole(camera, self.rectify)
+            for name, camera in capture.cameras.items()
+        }
 
     def show(self, done: int, total: int) -> None:
         """Report progress to whoever listens."""
         if self.on_progress:
             self.on_progress(done, total)
+
+
+def pinhole(camera: Camera, share: float = 1.0) -> Camera:
+    """The camera without distortion, otherwise the same, with `share` of the focal length."""
+    return replace(camera, model="PINHOLE", distortion=(), fx=camera.fx * share, fy=camera.fy * share)
 
 
 def write_text(path: Path, text: str) -> None:

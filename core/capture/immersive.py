@@ -24,7 +24,6 @@ from .video_set import find_videos, pair, video_capture
 
 FILE_NAME = "models.json"
 HELD_OUT = "camera_0001"
-RECTIFIED_FOCAL = 0.5  # of the fisheye's focal length, in the undistorted protocol
 _MAX_CAMERAS = 10_000
 
 
@@ -44,11 +43,6 @@ def read(path: Path, options: CaptureOptions) -> Capture:
         cameras[camera.name] = camera
     videos = pair(file, list(cameras), find_videos(path))
     return video_capture(file, cameras, videos, options)
-
-
-def rectified(camera: Camera, share: float = RECTIFIED_FOCAL) -> Camera:
-    """The pinhole camera of the same place, size and principal point with `share` of the focal length."""
-    return replace(camera, model="PINHOLE", distortion=(), fx=camera.fx * share, fy=camera.fy * share)
 
 
 def _entries(file: Path) -> list[Any]:
@@ -122,7 +116,8 @@ def target(camera: Camera) -> Camera:
 def write(capture: Capture, path: Path, export: Export) -> None:
     """Write camera_0001.mp4 (the held-out camera), camera_0002.mp4, … and models.json into `path`."""
     names = {name: f"camera_{number:04d}" for number, name in enumerate(held_out_first(capture), start=1)}
-    targets = {name: target(capture.cameras[name]) for name in names}
+    lenses = export.lenses(capture)
+    targets = {name: target(lenses[name]) for name in names}
     write_videos(capture, targets, {name: path / f"{file}.mp4" for name, file in names.items()}, export)
     entries = [_entry(names[name], camera) for name, camera in targets.items()]
     write_text(path / FILE_NAME, json.dumps(entries, indent=1, allow_nan=False) + "\n")

@@ -42,14 +42,15 @@ def _write_nerfstudio(capture: Capture, path: Path, export: Export) -> None:
     def place(name: str, frame: int) -> Path:
         return path / "images" / names[name] / f"{capture.frame_start + frame:06d}.png"
 
-    write_pictures(capture, dict(capture.cameras), place, export, alpha=True)
+    lenses = export.lenses(capture)
+    write_pictures(capture, lenses, place, export, alpha=True)
     seeds = {j: path / "points" / f"{capture.frame_start + j:06d}.ply" for j in capture.seeds}
     for frame, file in seeds.items():
         write_points(file, capture.seed_points(frame))
     if capture.depths:
         export.notes.append("Depth maps are not taken along.")
     images = {view: place(*view) for view in capture.images}
-    nerfstudio.write_capture(path, replace(capture, images=images, seeds=seeds, depths={}))
+    nerfstudio.write_capture(path, replace(capture, cameras=lenses, images=images, seeds=seeds, depths={}))
 
 
 LAYOUTS = {

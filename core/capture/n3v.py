@@ -8,6 +8,7 @@ resolution.
 """
 
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +18,7 @@ from ..camera import Camera, invert_rigid, rigid
 from ..errors import HoloreelError
 from ..files import atomic_path
 from .capture import Capture
-from .export import Export, held_out_first, write_videos
+from .export import Export, held_out_first, pinhole, write_videos
 from .options import CaptureOptions
 from .video_set import find_videos, probe_all, video_capture
 
@@ -87,23 +88,15 @@ def row_of(camera: Camera, near: float, far: float) -> NDArray[np.float64]:
 
 def target(camera: Camera) -> Camera:
     """The nearest camera that the layout can describe: centered, with square pixels and no distortion."""
-    return Camera(
-        camera.width,
-        camera.height,
-        camera.fx,
-        camera.fx,
-        camera.width / 2,
-        camera.height / 2,
-        camera.world_to_camera,
-        name=camera.name,
-    )
+    return replace(pinhole(camera), fy=camera.fx, cx=camera.width / 2, cy=camera.height / 2)
 
 
 def write(capture: Capture, path: Path, export: Export) -> None:
     """Write cam00.mp4 (the held-out camera), cam01.mp4, … and poses_bounds.npy into `path`."""
     order = held_out_first(capture)
     digits = max(2, len(str(len(order) - 1)))
-    targets = {name: target(capture.cameras[name]) for name in order}
+    lenses = export.lenses(capture)
+    targets = {name: target(lenses[name]) for name in order}
     write_videos(capture, targets, {name: path / f"cam{i:0{digits}d}.mp4" for i, name in enumerate(order)}, export)
     rows = np.stack([row_of(camera, *_bounds(capture, camera)) for camera in targets.values()])
     with atomic_path(path / FILE_NAME) as temporary:

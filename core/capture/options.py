@@ -28,8 +28,6 @@ class CaptureOptions:
     """Frames per second, where the files do not say so or are wrong."""
     frame_start: int | None = None
     """Number of the first frame on the timeline, instead of its number in the files."""
-    protocol: Literal["distorted", "undistorted"] = "distorted"
-    """Immersive: train on the fisheye pictures, or on pictures rectified to half the focal length."""
     calibration: Path | None = None
     """Videos: the calibration file, where it does not lie beside them as camera_array.toml or cameras_opencv.json."""
     sync_tolerance: float = 0.25

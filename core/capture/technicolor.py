@@ -12,7 +12,7 @@ from pathlib import Path
 from ..camera import Camera
 from ..errors import HoloreelError
 from .capture import MAX_FRAMES, Capture, View
-from .export import Export, held_out_first, write_pictures, write_text
+from .export import Export, held_out_first, pinhole, write_pictures, write_text
 from .images import picture_size
 from .options import CaptureOptions
 from .rotations import matrix_from_quaternion, quaternion_from_matrix
@@ -35,7 +35,7 @@ def read(path: Path, options: CaptureOptions) -> Capture:
     """Read the folder of a scene; only the chosen frames need to be there."""
     file = path / FILE_NAME
     rows = _rows(file)
-    pictures = _pictures(path)
+    scene, pictures = _pictures(path)
     numbers = sorted({frame for _, frame in pictures})
     chosen = options.choose_frames(path, range(numbers[0], numbers[-1] + 1))
     if len(chosen) > MAX_FRAMES:
@@ -50,7 +50,7 @@ def read(path: Path, options: CaptureOptions) -> Capture:
         camera, frame = missing[0]
         more = f" and {len(missing) - 1} more pictures are" if len(missing) > 1 else " is"
         raise HoloreelError(
-            f"{path}: SCENE_undist_{frame:05d}_{camera:02d}.png{more} missing; fetch what is missing, "
+            f"{path}: {scene}_undist_{frame:05d}_{camera:02d}.png{more} missing; fetch what is missing, "
             "or choose other --frames."
         )
     cameras = {}
@@ -90,8 +90,8 @@ def _rows(file: Path) -> list[list[float]]:
     return rows
 
 
-def _pictures(path: Path) -> dict[tuple[int, int], Path]:
-    """The pictures by (camera, frame number)."""
+def _pictures(path: Path) -> tuple[str, dict[tuple[int, int], Path]]:
+    """The scene's name, and the pictures by (camera, frame number)."""
     found: dict[tuple[int, int], Path] = {}
     scenes: set[str] = set()
     for file in path.iterdir():
@@ -103,7 +103,7 @@ def _pictures(path: Path) -> dict[tuple[int, int], Path]:
             f"{path} holds pictures SCENE_undist_FRAME_CAMERA.png of "
             f"{'the scenes ' + ', '.join(sorted(scenes)[:5]) if scenes else 'no scene'}; give the folder of one scene."
         )
-    return found
+    return scenes.pop(), found
 
 
 def _camera(file: Path, index: int, row: list[float], size: tuple[int, int], name: str) -> Camera:
@@ -120,26 +120,13 @@ def _camera(file: Path, index: int, row: list[float], size: tuple[int, int], nam
         raise HoloreelError(f"{file}: row {index}: {str(error).rstrip('.')}; fetch it again.") from error
 
 
-def target(camera: Camera) -> Camera:
-    """The camera without its distortion."""
-    return Camera(
-        camera.width,
-        camera.height,
-        camera.fx,
-        camera.fy,
-        camera.cx,
-        camera.cy,
-        camera.world_to_camera,
-        name=camera.name,
-    )
-
-
 def write(capture: Capture, path: Path, export: Export) -> None:
     """Write PATH's name as the scene's; the held-out camera becomes number 10 where there are more than 10, else 0."""
     order = held_out_first(capture)
     if len(order) > 10:
         order.insert(10, order.pop(0))
-    targets = {name: target(capture.cameras[name]) for name in order}
+    lenses = export.lenses(capture)
+    targets = {name: pinhole(lenses[name]) for name in order}
     numbers = {name: number for number, name in enumerate(order)}
 
     def place(name: str, frame: int) -> Path:

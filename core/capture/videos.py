@@ -133,5 +133,6 @@ def _times(file: Path, videos: Mapping[str, Path], facts: Mapping[str, VideoFact
 def write(capture: Capture, path: Path, export: Export) -> None:
     """Write CAMERA.mp4 for each camera and cameras_opencv.json into `path`; the held-out one is named by the reader."""
     names = file_names(capture)
-    write_videos(capture, dict(capture.cameras), {name: path / f"{file}.mp4" for name, file in names.items()}, export)
-    write_calibration(path / FILE_NAMES[1], {names[name]: camera for name, camera in capture.cameras.items()})
+    lenses = export.lenses(capture)
+    write_videos(capture, lenses, {name: path / f"{file}.mp4" for name, file in names.items()}, export)
+    write_calibration(path / FILE_NAMES[1], {names[name]: camera for name, camera in lenses.items()})
