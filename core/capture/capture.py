@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 
 from ..camera import Camera
 from ..errors import HoloreelError
-from .images import composite, read_depth, read_picture
+from .images import composite, fit, load_picture, read_depth
+from .media import Media, VideoFrame, media_path, read_frame
 from .points import Points, read_points
 
 View = tuple[str, int]  # camera name, frame index from 0
@@ -30,7 +31,7 @@ class Capture:
     """
 
     cameras: dict[str, Camera]  # by name, in order
-    images: dict[View, Path]
+    images: dict[View, Media]  # a picture's file, or a frame of a video
     frame_count: int = 1
     splits: dict[str, str] = field(default_factory=dict)  # by camera name; "train" where it says nothing
     fps: float = 30.0
@@ -101,13 +102,16 @@ class Capture:
         )
 
     def image(self, name: str, frame: int, background: tuple[float, float, float] | None = None) -> NDArray[np.uint8]:
-        """Read one picture: (H, W, 3), or (H, W, 4) with straight alpha where the file has alpha.
+        """Read one picture in its camera's size: (H, W, 3), or (H, W, 4) with straight alpha where the file has alpha.
 
-        With a `background` color (0 to 1) the picture is laid over it and is always (H, W, 3).
+        Files may be a whole number of times larger than the camera says; they are averaged down. With a `background`
+        color (0 to 1) the picture is laid over it and is always (H, W, 3).
         """
-        camera = self.cameras[name]
-        picture = read_picture(self.images[name, frame], camera.width, camera.height)
-        return picture if background is None else composite(picture, background)
+        camera, media = self.cameras[name], self.images[name, frame]
+        picture = read_frame(media) if isinstance(media, VideoFrame) else load_picture(media)
+        if background is not None:
+            picture = composite(picture, background)
+        return fit(picture, camera.width, camera.height, media)
 
     def depth(self, name: str, frame: int) -> NDArray[np.float32]:
         """Read one depth map: (H, W) planar z in scene units, infinity where nothing was hit."""
@@ -122,7 +126,7 @@ class Capture:
 
     def check_files(self) -> None:
         """Raise `HoloreelError` naming the first file that is missing, and how many more are."""
-        paths = dict.fromkeys((*self.images.values(), *self.depths.values(), *self.seeds.values()))
+        paths = dict.fromkeys((*map(media_path, self.images.values()), *self.depths.values(), *self.seeds.values()))
         missing = [path for path in paths if not os.path.isfile(path)]  # any name that cannot be is no file
         if missing:
             more = f" and {len(missing) - 1} more files" if len(missing) > 1 else ""

@@ -2,6 +2,7 @@
 """Reading one picture or one depth map of a capture. The libraries are imported when the first one is read."""
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,13 +16,55 @@ BACKGROUND_DEPTH = 1e9  # Cycles writes 1e10 where nothing was hit
 
 def read_picture(path: Path, width: int, height: int) -> NDArray[np.uint8]:
     """Read a picture as (height, width, 3), or (height, width, 4) with straight alpha where it has alpha."""
-    pixels = read_pixels(path)
-    if pixels.dtype == np.uint16:
-        picture = ((pixels.astype(np.uint32) * 255 + 32767) // 65535).astype(np.uint8)
-    else:
-        picture = pixels.astype(np.uint8, copy=False)
+    picture = load_picture(path)
     _check_size(path, picture.shape, width, height)
     return picture
+
+
+def load_picture(path: Path) -> NDArray[np.uint8]:
+    """Read a picture of any size, as `read_picture`."""
+    pixels = read_pixels(path)
+    if pixels.dtype == np.uint16:
+        return ((pixels.astype(np.uint32) * 255 + 32767) // 65535).astype(np.uint8)
+    return pixels.astype(np.uint8, copy=False)
+
+
+def fit(picture: NDArray[np.uint8], width: int, height: int, source: object) -> NDArray[np.uint8]:
+    """Bring a picture to its camera's size: the mean of n x n pixels where it is n times as large, for a whole n.
+
+    Straight alpha weighs the colors. Raises `HoloreelError` naming `source` for any other size.
+    """
+    n = picture.shape[0] // height
+    _check_size(source, picture.shape, max(n, 1) * width, max(n, 1) * height, f"{width}x{height}")
+    if n == 1:
+        return picture
+    if picture.shape[2] == 3:
+        return _block_means(picture, n)
+    alpha = picture[..., 3:].astype(np.float32)
+    weight = _block_sums(alpha, n)
+    color = _block_sums(picture[..., :3] * alpha, n) / np.maximum(weight, 1)
+    return np.rint(np.concatenate([color, weight / (n * n)], axis=2)).astype(np.uint8)
+
+
+def _block_means(picture: NDArray[np.uint8], n: int) -> NDArray[np.uint8]:
+    total = _block_sums(picture.astype(np.uint16 if n <= 16 else np.uint32), n)  # 16 · 16 · 255 < 2¹⁶
+    return ((total + n * n // 2) // (n * n)).astype(np.uint8)
+
+
+def _block_sums(values: NDArray[Any], n: int) -> NDArray[Any]:
+    rows = sum(values[i::n] for i in range(1, n)) + values[::n]
+    return sum(rows[:, j::n] for j in range(1, n)) + rows[:, ::n]
+
+
+def picture_size(path: Path) -> tuple[int, int]:
+    """Return width and height of a picture without decoding its pixels."""
+    from PIL import Image
+
+    try:
+        with Image.open(path) as picture:
+            return picture.size
+    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
+        raise HoloreelError(f"{path} cannot be read as a picture ({error}): fetch it again.") from error
 
 
 def composite(picture: NDArray[np.uint8], background: tuple[float, float, float]) -> NDArray[np.uint8]:
@@ -64,8 +107,9 @@ def write_depth(path: Path, depth: NDArray[np.float32]) -> None:
         OpenEXR.File(header, {"Z": pixels}).write(str(temporary))
 
 
-def _check_size(path: Path, shape: tuple[int, ...], width: int, height: int) -> None:
+def _check_size(source: object, shape: tuple[int, ...], width: int, height: int, wanted: str = "") -> None:
     if shape[:2] != (height, width):
         raise HoloreelError(
-            f"{path} is {shape[1]}x{shape[0]}, its camera says {width}x{height}: correct w and h, or the picture."
+            f"{source} is {shape[1]}x{shape[0]}, its camera says {wanted or f'{width}x{height}'}: "
+            "correct w and h, or the picture."
         )
