@@ -1,11 +1,12 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Training settings: the fields are the flags of `holoreel train stg`, and a run writes them beside its result."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
+from .decoder import Activation
+
 Model = Literal["lite", "full"]
-Activation = Literal["sigmoid", "clamp", "none"]
 Strategy = Literal["density", "mcmc"]
 Unit = Literal["footprint", "extent"]
 
@@ -159,6 +160,12 @@ class TrainConfig:
     """lengths in rates and density: what one pixel covers at each Gaussian's place, or the extent of the cameras"""
     dssim_weight: float = 0.2
     """loss = (1 − w) L1 + w (1 − SSIM) (Sec. 4.3)"""
+    segment: int = 50
+    """longer captures are cut into segments of at most so many frames, each a model of its own; 0: never"""
+    overlap: int = 0
+    """frames beyond its own on either side that a segment learns from too"""
+    share_static: bool = True
+    """let a segment begin with what stood still in the one before it, so that nothing jumps between them"""
     max_seeds: int = 40_000
     """at most this many Gaussians to begin with"""
     seed_frames: int = 1
@@ -197,4 +204,75 @@ class TrainConfig:
         return self.schedule or self.iterations
 
 
-PRESETS = {"lite": TrainConfig(), "full": TrainConfig(model="full")}
+# The settings of the authors' runs, in their units: lengths in extents, moments in parts of 30,000 iterations. What
+# their code does to single data sets (deleting what lies below a height, stopping rotations) is left out; the pruning
+# near cameras stands in its place.
+_PAPER_RATES = LearningRates(
+    means=1.6e-4,
+    means_final=1.6e-6,
+    motions=2.8e-4,
+    features=2.5e-3,
+    features_time=1e-3,
+    opacities=0.05,
+    scales=1.5e-3,
+    quats=1e-3,
+    omegas=1e-4,
+    trbf_centers=1e-4,
+    trbf_scales=0.03,
+    decoder=1e-4,
+    final_factor=1.0,
+)
+_PAPER_DENSITY = DensityConfig(
+    start=600 / 30_000,
+    stop=1100 / 30_000,
+    events=6,
+    gradient=2e-4,
+    split_size=0.01,
+    random_centers=True,
+    max_gaussians=2_000_000,
+    prune_opacity=0.005,
+    prune_stop=7000 / 30_000,
+    prune_box_at=(10_000 / 30_000,),
+    reset_at=(0.1, 0.2),
+)
+_PAPER_GUIDED = GuidedConfig(times=2, start=1600 / 30_000, stop=7000 / 30_000)
+_N3V = TrainConfig(
+    iterations=25_000,
+    schedule=30_000,
+    batch=2,
+    model="full",
+    decoder_output="sigmoid",
+    detach_time=True,
+    unit="extent",
+    max_seeds=2_000_000,
+    split_static=False,
+    seed_opacity=0.1,
+    moving_width=1.0,
+    clamp_colors=False,
+    rates=_PAPER_RATES,
+    density=_PAPER_DENSITY,
+    guided=_PAPER_GUIDED,
+)
+_TECHNICOLOR = replace(
+    _N3V,
+    decoder_output="clamp",
+    moving_width=0.135,
+    rates=replace(_PAPER_RATES, scales=5e-3),
+    density=replace(_PAPER_DENSITY, events=12, stop=1700 / 30_000),
+)
+_IMMERSIVE = replace(
+    _N3V,
+    iterations=20_000,
+    decoder_output="none",
+    rates=replace(_PAPER_RATES, means=1.6e-5, motions=4e-6),
+    density=replace(_PAPER_DENSITY, random_centers=False, prune_stop=9000 / 30_000),
+    guided=replace(_PAPER_GUIDED, times=3),
+)
+
+PRESETS = {
+    "lite": TrainConfig(),
+    "full": TrainConfig(model="full"),
+    "n3v": _N3V,
+    "technicolor": _TECHNICOLOR,
+    "immersive": _IMMERSIVE,
+}

@@ -14,7 +14,6 @@ from .scale import Measure
 
 BETAS = (0.9, 0.999)
 EPSILON = 1e-15  # gradients of a mean loss over a picture are tiny; the usual 1e-8 would damp the step
-DECODER = {"hidden": (6, 12), "output": (3, 6)}  # the tensors of a full model's network
 ROW_STATE = ("gradient", "views", "radius_px")  # of density control
 
 

@@ -130,8 +130,11 @@ def _sizes(
 def as_trained(gaussians: SpacetimeGaussians, config: TrainConfig) -> SpacetimeGaussians:
     """Return Gaussians as the run trains them: features of its model, and neutral where it leaves a part out.
 
-    The color of a lite one becomes the base of a full one, before the decoder's output function.
+    The color of a lite one becomes the base of a full one, before the decoder's output function. The other way round is
+    a ValueError.
     """
+    if config.model == "lite" and gaussians.variant == "full":
+        raise ValueError("a lite model cannot begin with Gaussians of a full one")
     features, motions = gaussians.features, gaussians.motions.copy()
     if config.model == "full" and gaussians.variant == "lite":
         base = features

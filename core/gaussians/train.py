@@ -19,12 +19,14 @@ from ..camera import Camera
 from ..capture import Capture, View
 from ..errors import HoloreelError
 from ..render.contract import Rendering, Rules
+from ..render.view import DecoderTensors, render_view
 from .config import TrainConfig
+from .decoder import SHAPES, Decoder
 from .density import SETTINGS, DensityControl
 from .guided import Patches, Stability, depth_range, measure_patches, new_gaussians, sample_rays, worst_patches
 from .mcmc import McmcControl
 from .model import SpacetimeGaussians
-from .parameters import DECODER, Parameters
+from .parameters import Parameters
 from .scale import measure_scene
 from .seeds import as_trained, gaussians_from_points
 
@@ -112,11 +114,20 @@ def _interrupts_between_steps() -> Iterator[Callable[[], None]]:
         signal.signal(signal.SIGINT, before)
 
 
+def valid_pixels(camera: Camera) -> Tensor | None:
+    """Return which pixels of a distorted lens can be rendered, (H, W) bool; None where all of them can."""
+    if camera.model == "PINHOLE":
+        return None
+    from ..render.warp import lens_warp
+
+    return torch.as_tensor(lens_warp(camera).valid)
+
+
 class Trainer:
     """One run: from a capture's seed points, or given Gaussians, to trained ones; resumable at any iteration.
 
     `seeds` are lite or full Gaussians to begin with instead of those made of the capture's points; for full ones,
-    `network` may be the decoder weights they were trained with (`hidden`, `output`).
+    `decoder` may be the network they were trained with.
     Raises `HoloreelError` where there is nothing to learn from or to begin with.
     """
 
@@ -126,7 +137,7 @@ class Trainer:
         config: TrainConfig,
         backend: ModuleType,
         seeds: SpacetimeGaussians | None = None,
-        network: Mapping[str, np.ndarray] | None = None,
+        decoder: Decoder | None = None,
     ):
         self.capture, self.config, self.backend = capture, config, backend
         self.views = capture.views("train")
@@ -151,7 +162,7 @@ class Trainer:
         self.rng = torch.Generator().manual_seed(config.seed)
         if seeds is None:
             seeds = self._fitted(gaussians_from_points(points, config, np.random.default_rng(config.seed)))
-        self.parameters = Parameters(as_trained(seeds, config), self._network(network), self.measure)
+        self.parameters = Parameters(as_trained(seeds, config), self._network(decoder), self.measure)
         self.pictures = PictureQueue(capture, self.views, config.background, config.seed, config.picture_memory)
         control = DensityControl if config.strategy == "density" else McmcControl
         self.control: DensityControl | McmcControl = control(config, self.scene, self.times)
@@ -170,16 +181,16 @@ class Trainer:
         seeds.log_scales = np.clip(seeds.log_scales, low, high).astype(np.float32)
         return seeds
 
-    def _network(self, given: Mapping[str, np.ndarray] | None) -> dict[str, Tensor]:
-        """Return the first weights of a full model's network: what it adds to the base color is zero."""
+    def _network(self, decoder: Decoder | None) -> dict[str, Tensor]:
+        """Return the first weights of a full model's network: what a new one adds to the base color is zero."""
         if self.config.model == "lite":
             return {}
-        if given is not None:
-            return {name: torch.tensor(np.asarray(given[name], np.float32)) for name in DECODER}
-        bound = 1.0 / math.sqrt(DECODER["hidden"][1])
-        hidden = (2.0 * torch.rand(DECODER["hidden"], generator=self.rng) - 1.0) * bound
+        if decoder is not None:
+            return {name: torch.from_numpy(getattr(decoder, name)) for name in SHAPES}
+        bound = 1.0 / math.sqrt(SHAPES["hidden"][1])
+        hidden = (2.0 * torch.rand(SHAPES["hidden"], generator=self.rng) - 1.0) * bound
         hidden[:, 6:9] *= self._origin_scale()
-        return {"hidden": hidden, "output": torch.zeros(DECODER["output"])}
+        return {"hidden": hidden, "output": torch.zeros(SHAPES["output"])}
 
     def _origin_scale(self) -> float:
         """Return what makes ray origins, the network's one input in world units, comparable with the others."""
@@ -238,9 +249,13 @@ class Trainer:
 
     def _learn(self, view: View, picture: np.ndarray) -> tuple[float, float]:
         """Render one view, compare it, and add to the gradients."""
+        camera = self.capture.cameras[view[0]]
         target = torch.from_numpy(picture).to(torch.float32).mul_(1.0 / 255.0)
-        rendering = self.render(self.capture.cameras[view[0]], self.capture.time(view[1]), training=True)
-        loss = self.backend.l1_dssim(rendering.features, target, self.config.dssim_weight)
+        rendering = self.render(camera, self.capture.time(view[1]), training=True)
+        colors, valid = rendering.features, valid_pixels(camera)
+        if valid is not None:  # equal outside, so that nothing is learned there
+            colors, target = colors * valid[..., None], target * valid[..., None]
+        loss = self.backend.l1_dssim(colors, target, self.config.dssim_weight)
         value = float(loss.detach())
         if not math.isfinite(value):
             raise HoloreelError(
@@ -248,24 +263,23 @@ class Trainer:
                 f"{view[0]!r}, frame {view[1]}); lower the learning rates, --rates.means and --rates.scales first."
             )
         (loss / self.config.batch).backward()
-        return value, float((rendering.features.detach() - target).square().mean())
+        mse = float((colors.detach() - target).square().mean())
+        return value, mse if valid is None else mse / max(float(valid.to(torch.float32).mean()), 1e-6)
 
     def render(self, camera: Camera, time: float, training: bool = False) -> Rendering:
         """Render what has been learned as a camera sees it at a normalized time: colors (H, W, 3), alpha, depth."""
-        gaussians, network = self.parameters.spacetime, self.parameters.network
-        density = self.parameters.stats if training else None
-        if not network:
-            return self.backend.rasterize_spacetime(gaussians, time, camera, self.background, self.rules, density)
-        dt = (time - gaussians.trbf_centers)[:, None]
-        dt = dt.detach() if self.config.detach_time else dt
-        features = torch.cat([gaussians.features[:, :6], gaussians.features[:, 6:] * dt], dim=1)
-        rendering = self.backend.rasterize_spacetime(
-            gaussians._replace(features=features), time, camera, None, self.rules, density
+        network = self.parameters.network
+        decoder = DecoderTensors(**network, activation=self.config.decoder_output) if network else None
+        return render_view(
+            self.backend,
+            self.parameters.spacetime,
+            time,
+            camera,
+            self.background,
+            decoder,
+            self.rules,
+            self.parameters.stats if training else None,
         )
-        colors = self.backend.decode(
-            rendering.features, camera, network["hidden"], network["output"], self.config.decoder_output
-        )
-        return rendering._replace(features=colors)
 
     def _pace(self) -> float:
         """Return what is left of the positions' learning rate."""
@@ -280,7 +294,7 @@ class Trainer:
         features: float | Tensor = rates.features * decay
         if config.model == "full":
             features = torch.tensor([rates.features * decay] * 6 + [rates.features_time * decay] * 3)
-        inputs = torch.ones(DECODER["hidden"][1])
+        inputs = torch.ones(SHAPES["hidden"][1])
         inputs[6:9] = self._origin_scale()
         temporal = decay if config.temporal_opacity else 0.0
         return {
@@ -344,12 +358,22 @@ class Trainer:
         config, camera = self.config.guided, self.capture.cameras[view[0]]
         truth = self.capture.image(*view, background=self.config.background).astype(np.float32) / 255.0
         rendering = self.render(camera, self.capture.time(view[1]))
-        patches = measure_patches(rendering.features.numpy(), truth, config.patch)
+        valid = valid_pixels(camera)
+        patches = measure_patches(
+            rendering.features.numpy(), truth, config.patch, None if valid is None else valid.numpy()
+        )
         return patches, depth_range(rendering.depth.numpy(), rendering.alpha.numpy(), config.far)
 
     def gaussians(self) -> SpacetimeGaussians:
         """Copy the trained Gaussians out."""
         return self.parameters.to_gaussians()
+
+    def decoder(self) -> Decoder | None:
+        """Copy a full model's network out; None for a lite one."""
+        if not self.parameters.network:
+            return None
+        weights = {name: value.detach().numpy().copy() for name, value in self.parameters.network.items()}
+        return Decoder(**weights, activation=self.config.decoder_output)
 
     def state(self) -> dict[str, object]:
         """Everything needed to go on from here bit for bit."""

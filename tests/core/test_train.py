@@ -3,6 +3,7 @@
 
 import json
 import signal
+from dataclasses import replace
 from pathlib import Path
 
 import imageio.v3 as imageio
@@ -13,7 +14,7 @@ from holoreel.core.camera import Camera
 from holoreel.core.capture import Capture, Points, read_capture, write_capture, write_points
 from holoreel.core.cli import main
 from holoreel.core.errors import HoloreelError
-from holoreel.core.gaussians.config import DensityConfig, TrainConfig
+from holoreel.core.gaussians.config import PRESETS, DensityConfig, GuidedConfig, LearningRates, McmcConfig, TrainConfig
 from holoreel.core.gaussians.model import SpacetimeGaussians
 from holoreel.core.gaussians.parameters import Parameters
 from holoreel.core.gaussians.run import RunPaths, train_reel
@@ -83,9 +84,7 @@ def heldout_psnr(trainer: Trainer, capture: Capture) -> float:
     errors = []
     for name, frame in capture.views("test"):
         with torch.no_grad():
-            rendered = trainer.backend.rasterize_spacetime(
-                trainer.parameters.spacetime, capture.time(frame), capture.cameras[name]
-            ).features
+            rendered = trainer.render(capture.cameras[name], capture.time(frame)).features.clamp(0, 1)
         errors.append(np.mean((rendered.numpy() - capture.image(name, frame) / 255.0) ** 2))
     return float(-10 * np.log10(np.mean(errors)))
 
@@ -101,20 +100,47 @@ def test_training_learns_a_view_it_never_saw(capture: Capture) -> None:
     assert trainer.history[-1][0] == 400
 
 
-def test_same_seed_same_result_and_resuming_changes_nothing(capture: Capture, tmp_path: Path) -> None:
-    backend = get_backend()
-    straight = Trainer(capture, QUICK, backend)
+def assert_same(a: Trainer, b: Trainer) -> None:
+    """Two runs have come to the same bits."""
+    assert a.iteration == b.iteration
+    for name, value in {**a.parameters.tensors, **a.parameters.network}.items():
+        other = {**b.parameters.tensors, **b.parameters.network}[name]
+        assert torch.equal(value, other), name
+
+
+# Each must do what makes it special within 23 iterations and again after: guided sampling when a window of one
+# iteration has ended, relocation every few.
+VARIANTS = {
+    "lite": QUICK,
+    "full": replace(QUICK, model="full", decoder_output="sigmoid", batch=2),
+    "mcmc": replace(QUICK, strategy="mcmc", mcmc=McmcConfig(every=4, start=0.0, growth=0.1)),
+    "guided": replace(
+        QUICK, guided=GuidedConfig(times=3, start=0.5, stop=1.0, stable=0.9, patch=8, contrast=1.0, samples=3)
+    ),
+    "extent": replace(QUICK, unit="extent", rates=LearningRates(means=1e-4, means_final=1e-5, motions=1e-4)),
+}
+
+
+@pytest.mark.parametrize("name", VARIANTS)
+def test_same_seed_same_result_and_resuming_changes_nothing(capture: Capture, tmp_path: Path, name: str) -> None:
+    backend, config = get_backend(), VARIANTS[name]
+    straight = Trainer(capture, config, backend)
+    begun = len(straight.parameters)
     straight.run(lambda progress: None)
-    first = Trainer(capture, QUICK, backend)
+    first = Trainer(capture, config, backend)
     first.run(lambda progress: None, until=23)
     path = tmp_path / "state.pt"
     torch.save(first.state(), path)
-    second = Trainer(capture, QUICK, backend)
+    second = Trainer(capture, config, backend)
     second.load_state(torch.load(path, weights_only=True))
     second.run(lambda progress: None)
-    for name, value in straight.parameters.tensors.items():
-        assert torch.equal(value, second.parameters.tensors[name]), name
-    assert len(straight.parameters) != len(first.parameters) or straight.iteration == second.iteration == 40
+    assert_same(straight, second)
+    assert straight.iteration == 40
+    if name == "guided":
+        assert len(straight.guided_at) == 3
+        assert straight.guided_at[0] < 23 < straight.guided_at[-1]
+    if name == "mcmc":
+        assert len(straight.parameters) > begun
 
 
 def test_interrupted_run_leaves_a_checkpoint_and_resumes_to_a_reel(capture: Capture, tmp_path: Path) -> None:
@@ -211,3 +237,169 @@ def test_broken_checkpoint_is_refused(capture: Capture, tmp_path: Path) -> None:
     RunPaths(out).checkpoint.write_bytes(b"not a checkpoint")
     with pytest.raises(HoloreelError, match="not a readable checkpoint"):
         train_reel(capture, out, QUICK, get_backend(), lambda progress: None, resume=True)
+
+
+@pytest.mark.parametrize("activation", ["sigmoid", "clamp", "none"])
+def test_full_model_learns_a_view_it_never_saw(capture: Capture, activation: str) -> None:
+    trainer = Trainer(capture, TrainConfig(iterations=300, model="full", decoder_output=activation), get_backend())
+    before = heldout_psnr(trainer, capture)
+    trainer.run(lambda progress: None)
+    assert heldout_psnr(trainer, capture) > before + 3
+    assert trainer.gaussians().variant == "full"
+    decoder = trainer.decoder()
+    assert decoder.activation == activation
+    assert np.abs(decoder.output).max() > 0
+
+
+def test_full_model_begins_with_the_colors_of_the_lite_one(capture: Capture) -> None:
+    """The network adds nothing yet, and a sigmoid's base color is what it turns into the seed's."""
+    lite = Trainer(capture, QUICK, get_backend())
+    pictures = {}
+    for activation in ("none", "clamp", "sigmoid"):
+        full = Trainer(capture, replace(QUICK, model="full", decoder_output=activation), get_backend())
+        with torch.no_grad():
+            pictures[activation] = full.render(capture.cameras["cam00"], 0.25)
+    with torch.no_grad():
+        wanted = lite.render(capture.cameras["cam00"], 0.25)
+    for name in ("none", "clamp"):
+        torch.testing.assert_close(pictures[name].features, wanted.features, rtol=0, atol=1e-5)
+    opaque = wanted.alpha > 0.99
+    assert opaque.any()
+    off = (pictures["sigmoid"].features - wanted.features)[opaque].abs()
+    assert off.mean() < 0.03
+
+
+def test_what_is_rendered_is_what_the_model_says(capture: Capture) -> None:
+    """The trained picture against the model's own evaluation in float64, drawn as plain 3D Gaussians and decoded."""
+    trainer = Trainer(capture, replace(QUICK, model="full", decoder_output="clamp"), get_backend())
+    trainer.run(lambda progress: None)
+    camera = capture.cameras["cam00"]
+    with torch.no_grad():
+        picture = trainer.render(camera, 0.6).features.numpy()
+        now = trainer.gaussians().evaluate(0.6)
+        arrays = (now.means, now.quats, now.scales, now.opacities, now.features)
+        features = trainer.backend.rasterize(*map(torch.from_numpy, arrays), camera).features.numpy()
+    origins, directions = camera.rays()
+    wanted = trainer.decoder().decode(features.reshape(-1, 9), origins, directions).reshape(picture.shape)
+    assert np.abs(trainer.gaussians().features[:, 6:]).max() > 0.01
+    np.testing.assert_allclose(picture, wanted, atol=2e-4)
+
+
+def test_parts_that_are_turned_off_stay_neutral(capture: Capture) -> None:
+    backend = get_backend()
+
+    def trained(**settings: object) -> SpacetimeGaussians:
+        trainer = Trainer(capture, replace(VARIANTS["guided"], **settings), backend)
+        trainer.run(lambda progress: None)
+        return trainer.gaussians()
+
+    everything = trained()
+    assert everything.motions[:, 2].any()
+    assert everything.omegas.any()
+    assert np.abs(everything.motions).max() > 0
+    for order in range(3):
+        model = trained(motion=order)
+        assert not model.motions[:, order:].any()
+        assert order == 0 or model.motions[:, order - 1].any()
+    assert not trained(rotation=0).omegas.any()
+    always = trained(temporal_opacity=False)
+    for time in (-1.0, 0.0, 0.7, 2.0):  # what is there is there for good
+        np.testing.assert_allclose(always.evaluate(time).opacities, always.evaluate(0.5).opacities, rtol=1e-6)
+    assert len(np.unique(always.trbf_centers)) <= FRAMES + 1
+
+
+def test_centers_learn_from_opacity_alone_where_asked(capture: Capture) -> None:
+    """With motion detached and every Gaussian always there, nothing is left to pull at the temporal centers."""
+    pulls = {}
+    for detach in (False, True):
+        seeds = true_scene()
+        seeds.trbf_log_scales[:] = 8.0
+        trainer = Trainer(capture, replace(QUICK, detach_time=detach, model="full"), get_backend(), seeds)
+        with torch.no_grad():
+            trainer.parameters.tensors["features"][:, 6:] = 0.5
+        rendering = trainer.render(capture.cameras["cam01"], 0.5, training=True)
+        rendering.features.square().sum().backward()
+        pulls[detach] = float(trainer.parameters.tensors["trbf_centers"].grad.abs().max())
+    assert pulls[True] < 1e-3 * pulls[False]
+
+
+def test_given_gaussians_are_where_a_run_begins(capture: Capture) -> None:
+    backend, seeds = get_backend(), true_scene()
+    no_points = Capture(capture.cameras, capture.images, FRAMES, capture.splits)
+    warm = Trainer(no_points, QUICK, backend, seeds)
+    np.testing.assert_array_equal(warm.gaussians().means, seeds.means)
+    assert heldout_psnr(warm, capture) > 45
+    full = Trainer(capture, replace(QUICK, model="full"), backend)
+    full.run(lambda progress: None)
+    again = Trainer(capture, replace(QUICK, model="full"), backend, full.gaussians(), full.decoder())
+    assert heldout_psnr(again, capture) == pytest.approx(heldout_psnr(full, capture), abs=1e-3)
+    with pytest.raises(ValueError, match="full"):
+        Trainer(capture, QUICK, backend, full.gaussians())
+
+
+def moved(capture: Capture, folder: Path, scale: float, angle: float) -> Capture:
+    """The same capture in a world that is scaled and turned."""
+    c, s = np.cos(angle), np.sin(angle)
+    turn = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]]) @ np.array([[1, 0, 0], [0, c, -s], [0, s, c]])
+    cameras, seeds = {}, {}
+    for name, camera in capture.cameras.items():
+        pose = camera.world_to_camera.copy()
+        pose[:3, :3] = pose[:3, :3] @ turn.T
+        pose[:3, 3] *= scale
+        cameras[name] = replace(camera, world_to_camera=pose)
+    for frame in capture.seeds:
+        points = capture.seed_points(frame)
+        seeds[frame] = folder / f"{frame}.ply"
+        write_points(seeds[frame], Points((scale * points.xyz @ turn.T).astype(np.float32), points.rgb))
+    return replace(capture, cameras=cameras, seeds=seeds)
+
+
+@pytest.mark.parametrize(("scale", "angle"), [(1e-3, 0.0), (1e4, 0.0), (7.0, 1.1)])
+@pytest.mark.parametrize("model", ["lite", "full"])
+def test_neither_unit_nor_axes_of_the_world_matter(
+    capture: Capture, tmp_path: Path, scale: float, angle: float, model: str
+) -> None:
+    config = replace(QUICK, iterations=150, model=model)
+    results = []
+    for world in (capture, moved(capture, tmp_path, scale, angle)):
+        trainer = Trainer(world, config, get_backend())
+        trainer.run(lambda progress: None)
+        results.append((heldout_psnr(trainer, world), len(trainer.parameters)))
+    assert results[1][0] == pytest.approx(results[0][0], abs=0.5)
+    assert results[1][1] == pytest.approx(results[0][1], rel=0.1)
+    assert results[0][0] > 22
+
+
+@pytest.mark.parametrize(
+    ("density", "message"),
+    [
+        (DensityConfig(prune_opacity=0.9999, prune_every=5), "too transparent.*--density.prune-opacity"),
+        (DensityConfig(prune_depth=50.0, prune_every=5), "too near to a camera.*--density.prune-depth"),
+    ],
+)
+def test_a_scene_that_prunes_to_nothing_stops_with_the_reason(
+    capture: Capture, density: DensityConfig, message: str
+) -> None:
+    trainer = Trainer(capture, replace(QUICK, density=density), get_backend())
+    with pytest.raises(HoloreelError, match=f"Gaussians are left at iteration 5.*{message}"):
+        trainer.run(lambda progress: None)
+
+
+def test_a_loss_that_is_not_finite_stops_with_the_reason(capture: Capture) -> None:
+    trainer = Trainer(capture, replace(QUICK, model="full"), get_backend())
+    with torch.no_grad():
+        trainer.parameters.network["output"][0, 0] = float("nan")
+    with pytest.raises(HoloreelError, match=r"not finite at iteration 1 .*--rates\.means"):
+        trainer.run(lambda progress: None)
+
+
+@pytest.mark.parametrize("name", PRESETS)
+def test_every_preset_trains_and_its_moments_come(capture: Capture, name: str) -> None:
+    preset = PRESETS[name]
+    assert preset.iterations <= preset.planned
+    assert preset.guided.times <= 3
+    config = replace(preset, iterations=120, schedule=0)
+    trainer = Trainer(capture, config, get_backend())
+    before = heldout_psnr(trainer, capture)
+    trainer.run(lambda progress: None)
+    assert heldout_psnr(trainer, capture) > before
