@@ -14,6 +14,7 @@ from ..errors import HoloreelError
 from .capture import Capture, View
 from .colmap_model import find_model, points_file, read_cameras, write_model
 from .export import Export, file_names, write_pictures
+from .media import Media
 from .options import CaptureOptions
 
 _FOLDER = re.compile(r"colmap_(\d{1,7})")
@@ -42,7 +43,7 @@ def read(path: Path, options: CaptureOptions) -> Capture:
         )
     posed = read_cameras(model)
     names = _camera_names(model, posed)
-    images: dict[View, Path] = {}
+    images: dict[View, Media] = {}
     seeds: dict[int, Path] = {}
     for j, number in enumerate(chosen):
         for image, name in names.items():

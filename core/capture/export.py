@@ -17,7 +17,7 @@ from ..camera import Camera
 from ..errors import HoloreelError
 from ..files import atomic_path
 from .capture import Capture
-from .resample import lens_map, same_lens
+from .resample import LensMap, lens_map, same_lens
 
 Picture = NDArray[np.uint8]
 _QUALITY = "10"  # x264's constant rate factor: the difference to the source is under the pictures' own noise
@@ -142,7 +142,8 @@ class _Lenses:
 
     def __init__(self, capture: Capture, targets: Mapping[str, Camera]) -> None:
         self._capture, self._targets = capture, targets
-        self._name, self._map = "", None
+        self._name = ""
+        self._map: LensMap | None = None
 
     def picture(self, name: str, frame: int, background: tuple[float, float, float] | None) -> Picture:
         picture = self._capture.image(name, frame, background)

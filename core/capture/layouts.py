@@ -9,8 +9,9 @@ from typing import Any
 
 from ..errors import HoloreelError
 from . import colmap, immersive, n3v, nerfstudio, sfm_result, technicolor, videos
-from .capture import Capture
+from .capture import Capture, View
 from .export import Export, file_names, write_pictures
+from .media import Media
 from .options import CaptureOptions
 from .points import write_points
 
@@ -49,7 +50,7 @@ def _write_nerfstudio(capture: Capture, path: Path, export: Export) -> None:
         write_points(file, capture.seed_points(frame))
     if capture.depths:
         export.notes.append("Depth maps are not taken along.")
-    images = {view: place(*view) for view in capture.images}
+    images: dict[View, Media] = {view: place(*view) for view in capture.images}
     nerfstudio.write_capture(path, replace(capture, cameras=lenses, images=images, seeds=seeds, depths={}))
 
 

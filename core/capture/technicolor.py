@@ -14,6 +14,7 @@ from ..errors import HoloreelError
 from .capture import MAX_FRAMES, Capture, View
 from .export import Export, held_out_first, pinhole, write_pictures, write_text
 from .images import picture_size
+from .media import Media
 from .options import CaptureOptions
 from .rotations import matrix_from_quaternion, quaternion_from_matrix
 
@@ -57,7 +58,7 @@ def read(path: Path, options: CaptureOptions) -> Capture:
     for index, row in enumerate(rows):
         name = f"cam{index:02d}"
         cameras[name] = _camera(file, index, row, picture_size(pictures[index, chosen.start]), name)
-    images: dict[View, Path] = {
+    images: dict[View, Media] = {
         (f"cam{c:02d}", j): pictures[c, n] for j, n in enumerate(chosen) for c in range(len(rows))
     }
     return Capture(

@@ -17,9 +17,9 @@ from ..camera import Camera
 from ..errors import HoloreelError
 from . import sfm_result
 from .calibration import FILE_NAMES, find_calibration, read_calibration, write_calibration
-from .capture import Capture
+from .capture import Capture, View
 from .export import Export, file_names, write_videos
-from .media import VideoFacts, VideoFrame
+from .media import Media, VideoFacts, VideoFrame
 from .options import CaptureOptions
 from .sync import FILE_NAME as TIMESTAMPS
 from .sync import read_timestamps, synchronize
@@ -104,7 +104,9 @@ def _capture(
     clock = synchronize(path / TIMESTAMPS, times)
     clock.check(path / TIMESTAMPS, options.sync_tolerance)
     chosen = options.choose_frames(path, range(clock.ticks))
-    images = {(n, j): VideoFrame(videos[n], int(clock.frames[n][k])) for j, k in enumerate(chosen) for n in cameras}
+    images: dict[View, Media] = {
+        (n, j): VideoFrame(videos[n], int(clock.frames[n][k])) for j, k in enumerate(chosen) for n in cameras
+    }
     return Capture(
         cameras=cameras,
         images=images,

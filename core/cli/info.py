@@ -7,25 +7,33 @@ from typing import Annotated, Any
 
 import tyro
 
-from ..capture import read_capture
+from ..capture import CaptureOptions, read_capture
+from ..capture.layouts import find_layout
+from ..capture.media import media_path
 from ..reel import Loaded, load_gaussians
 
 
-def run(file: tyro.conf.Positional[Path], /, as_json: Annotated[bool, tyro.conf.arg(name="json")] = False) -> None:
+def run(
+    file: tyro.conf.Positional[Path],
+    /,
+    as_json: Annotated[bool, tyro.conf.arg(name="json")] = False,
+    options: Annotated[CaptureOptions, tyro.conf.arg(name="")] = CaptureOptions(),  # noqa: B008
+) -> None:
     """Say what a file holds, and what is unusual or wrong.
 
     Args:
-        file: a .reel, .ply or .splatv, or a capture (folder or transforms.json).
+        file: a .reel, .ply or .splatv, or a capture (a folder in any layout, or a transforms.json).
         as_json: print JSON for programs to read.
+        options: how a capture is read.
     """
-    facts = describe(file)
+    facts = describe(file, options)
     print(json.dumps(facts, indent=1, allow_nan=False) if as_json else table(facts))
 
 
-def describe(path: Path) -> dict[str, Any]:
+def describe(path: Path, options: CaptureOptions) -> dict[str, Any]:
     """Return the facts about one file, ready for JSON; `problems` lists sentences."""
     if path.is_dir() or path.suffix.lower() == ".json":
-        return describe_capture(path)
+        return describe_capture(path, options)
     loaded = load_gaussians(path)
     return describe_reel(loaded) if loaded.reel else describe_gaussians(loaded)
 
@@ -75,9 +83,9 @@ def describe_reel(first: Loaded) -> dict[str, Any]:
     }
 
 
-def describe_capture(path: Path) -> dict[str, Any]:
-    """Return the facts about a capture; that all its files exist was checked on reading."""
-    capture = read_capture(path)
+def describe_capture(path: Path, options: CaptureOptions) -> dict[str, Any]:
+    """Return the facts about a capture in any layout; that all its files exist was checked on reading."""
+    capture = read_capture(path, options)
     missing = len(capture.cameras) * capture.frame_count - len(capture.images)
     problems = []
     if missing:
@@ -89,6 +97,7 @@ def describe_capture(path: Path) -> dict[str, Any]:
     return {
         "file": str(capture.source),
         "what": "a multi-view capture",
+        "layout": find_layout(path, options),
         "cameras": {
             name: f"{camera.width}x{camera.height} {camera.model}, {capture.split(name)}"
             for name, camera in capture.cameras.items()
@@ -97,7 +106,8 @@ def describe_capture(path: Path) -> dict[str, Any]:
         "pictures": len(capture.images),
         "depth maps": len(capture.depths),
         "frames with seed points": len(capture.seeds),
-        "bytes on disk": sum(file.stat().st_size for file in capture.images.values()),
+        "bytes on disk": sum(file.stat().st_size for file in set(map(media_path, capture.images.values()))),
+        "notes": list(capture.notes),
         "problems": problems,
     }
 
