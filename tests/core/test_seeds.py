@@ -5,7 +5,8 @@ import numpy as np
 import pytest
 from holoreel.core.capture import Points
 from holoreel.core.gaussians.config import TrainConfig
-from holoreel.core.gaussians.seeds import gaussians_from_points, neighbor_distances
+from holoreel.core.gaussians.model import sigmoid
+from holoreel.core.gaussians.seeds import as_trained, chosen_points, gaussians_from_points, neighbor_distances
 
 FRAMES = 8
 
@@ -64,3 +65,48 @@ def test_a_single_frame_is_static() -> None:
     frames = wall_and_ball(np.random.default_rng(0))[:1]
     gaussians = gaussians_from_points(frames, TrainConfig(), np.random.default_rng(0))
     assert np.allclose(np.exp(gaussians.trbf_log_scales), TrainConfig().static_width)
+
+
+def test_some_frames_give_all_their_points_and_some_the_lonely_ones() -> None:
+    rng = np.random.default_rng(0)
+    dense, lonely = rng.uniform(0, 1, (300, 3)), 50 + 20.0 * np.stack(np.mgrid[:5, :5, :4], axis=-1).reshape(100, 3)
+    frames = [
+        Points(np.concatenate([dense, lonely]).astype(np.float32), np.full((400, 3), frame, np.uint8))
+        for frame in range(6)
+    ]
+    config = TrainConfig(seed_frames=2, sparse_share=0.25)
+    chosen = chosen_points(frames, config).reshape(6, 400)
+    assert chosen[0].all()
+    for frame in (2, 4):
+        assert chosen[frame, 300:].all()
+        assert not chosen[frame, :300].any()
+    assert not chosen[1::2].any()
+    assert chosen_points(frames, TrainConfig()).all()
+
+
+def test_without_the_split_every_point_belongs_to_its_frame() -> None:
+    points = wall_and_ball(np.random.default_rng(0))
+    config = TrainConfig(split_static=False, moving_width=0.135, seed_frames=4)
+    gaussians = gaussians_from_points(points, config, np.random.default_rng(1))
+    assert len(gaussians) == 2 * 3200
+    assert np.unique(gaussians.trbf_centers).tolist() == [0.0, 0.5]
+    np.testing.assert_allclose(np.exp(gaussians.trbf_log_scales), 0.135, rtol=1e-5)
+    frame_of = {tuple(row): index / FRAMES for index, frame in enumerate(points) for row in frame.xyz.tolist()}
+    centers = [frame_of[tuple(row)] for row in gaussians.means.tolist()]
+    np.testing.assert_array_equal(gaussians.trbf_centers, np.array(centers, np.float32))
+
+
+def test_seeds_become_what_the_run_trains() -> None:
+    lite = gaussians_from_points(wall_and_ball(np.random.default_rng(0)), TrainConfig(), np.random.default_rng(1))
+    lite.motions[:], lite.omegas[:] = 1.0, 1.0
+    full = as_trained(lite, TrainConfig(model="full", decoder_output="sigmoid", motion=1, rotation=0))
+    assert full.variant == "full"
+    np.testing.assert_allclose(sigmoid(full.features[:, :3]), np.clip(lite.features, 0.02, 0.98), atol=1e-6)
+    assert not full.features[:, 3:].any()
+    assert (full.motions[:, 0] == 1).all()
+    assert not full.motions[:, 1:].any()
+    assert not full.omegas.any()
+    again = as_trained(full, TrainConfig(model="full", temporal_opacity=False))
+    np.testing.assert_array_equal(again.features, full.features)
+    assert (again.evaluate(-100.0).opacities == again.evaluate(3.0).opacities).all()
+    assert lite.omegas.all()  # what was given stays as it is
