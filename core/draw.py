@@ -13,12 +13,15 @@ from numpy.typing import NDArray
 from .camera import Camera
 from .capture import Capture
 from .errors import HoloreelError
+from .gaussians.decoder import Activation
 from .gaussians.model import SpacetimeGaussians
 from .reel import Loaded, Triple, load_gaussians
 from .render import get_backend
 from .render.contract import SpacetimeTensors
+from .render.view import DecoderTensors, decoder_tensors, render_view
 
 Backend = Literal["auto", "cpu", "reference"]
+SEGMENTS_HELD = 2  # in memory at a time: going back and forth over a seam reads nothing twice
 
 
 class Drawing(NamedTuple):
@@ -33,35 +36,46 @@ class Drawing(NamedTuple):
 
 
 def draw(
-    gaussians: SpacetimeTensors, time: float, camera: Camera, backend: ModuleType, background: Triple = (0.0, 0.0, 0.0)
+    gaussians: SpacetimeTensors,
+    time: float,
+    camera: Camera,
+    backend: ModuleType,
+    background: Triple = (0.0, 0.0, 0.0),
+    decoder: DecoderTensors | None = None,
 ) -> Drawing:
-    """Draw Gaussians at a normalized time; `backend` as `core.render.get_backend` returns it."""
+    """Draw Gaussians at a normalized time through any lens; `backend` as `core.render.get_backend` returns it.
+
+    With a `decoder`, `background` is ignored: it colors every pixel.
+    """
     with torch.no_grad():
-        rendering = backend.rasterize_spacetime(gaussians, time, camera, torch.tensor(background))
+        rendering = render_view(backend, gaussians, time, camera, torch.tensor(background), decoder)
     return Drawing(*(part.numpy() for part in rendering))
 
 
-def to_tensors(gaussians: SpacetimeGaussians) -> SpacetimeTensors:
-    """Return the parameters as tensors that can be drawn: of a full model, the base color alone."""
+def to_tensors(gaussians: SpacetimeGaussians, decoded: bool = False) -> SpacetimeTensors:
+    """Return the parameters as tensors that can be drawn: of a full model, all features if they shall be `decoded`,
+    else the base color alone."""
     arrays = {name: getattr(gaussians, name) for name in SpacetimeTensors._fields}
-    arrays["features"] = np.ascontiguousarray(arrays["features"][:, :3])
+    if not decoded:
+        arrays["features"] = np.ascontiguousarray(arrays["features"][:, :3])
     return SpacetimeTensors(**{name: torch.from_numpy(array) for name, array in arrays.items()})
 
 
 class Player:
-    """Draws the frames of one file, one segment in memory at a time.
+    """Draws the frames of one file, lite or full, with few of its segments in memory at a time.
 
     Frames are those of the timeline, sub-frames allowed: `frame_start` to `frame_start + frame_count - 1`.
+    `decoder_output` is as in `core.reel.load_gaussians`.
     """
 
-    def __init__(self, path: str | Path, backend: Backend = "auto"):
+    def __init__(self, path: str | Path, backend: Backend = "auto", decoder_output: Activation | None = None):
         self.path = Path(path)
         self.backend = get_backend(backend)
-        self.first: Loaded = load_gaussians(self.path)
+        self.first: Loaded = load_gaussians(self.path, decoder_output=decoder_output)
         self.report = self.first.report
         whole = self.first.reel or self.first
         self.frame_start, self.frame_count = whole.frame_start, whole.frame_count
-        self._tensors = lru_cache(maxsize=1)(self._load)
+        self._segment = lru_cache(maxsize=SEGMENTS_HELD)(self._load)
 
     def frame_at(self, time: float) -> float:
         """Return the frame at a normalized time of the whole file: 0 is the first one, 1 is just after the last."""
@@ -85,17 +99,14 @@ class Player:
         return [float(frame) for frame in range(start, end + 1)]
 
     def draw(self, camera: Camera, frame: float, background: Triple | None = None) -> Drawing:
-        """Draw one frame, over the reel's own background unless another is given."""
+        """Draw one frame, over the reel's own background unless another is given; a full model has none."""
         reel = self.first.reel
         segment, time = reel.locate(frame) if reel else (0, self.first.time_of(frame))
-        return draw(
-            self._tensors(segment),
-            time,
-            camera,
-            self.backend,
-            self.first.background if background is None else background,
-        )
+        gaussians, decoder = self._segment(segment)
+        color = self.first.background if background is None else background
+        return draw(gaussians, time, camera, self.backend, color, decoder)
 
-    def _load(self, segment: int) -> SpacetimeTensors:
+    def _load(self, segment: int) -> tuple[SpacetimeTensors, DecoderTensors | None]:
         loaded = self.first if segment == 0 else load_gaussians(self.path, segment)
-        return to_tensors(loaded.gaussians)
+        decoder = decoder_tensors(loaded.decoder) if loaded.decoder else None
+        return to_tensors(loaded.gaussians, decoded=decoder is not None), decoder

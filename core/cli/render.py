@@ -14,6 +14,7 @@ from ..camera import read_camera
 from ..capture import Capture, read_capture
 from ..draw import Backend, Drawing, Player
 from ..errors import HoloreelError
+from ..gaussians.decoder import Activation
 from ..images import picture_path, write_image
 from ..reel import Triple
 
@@ -29,6 +30,7 @@ def run(
     frame: float | None = None,
     background: str | None = None,
     format: Literal["png", "exr"] = "png",
+    decoder_output: Activation | None = None,
     backend: Backend = "auto",
 ) -> None:
     """Draw a reel, PLY or .splatv: one picture of one camera, or all frames of all cameras of a capture.
@@ -43,8 +45,9 @@ def run(
         split: which cameras of the capture.
         time: normalized time, 0 at the first frame, 1 after the last.
         frame: instead, a frame of the timeline; sub-frames allowed.
-        background: color behind everything as R,G,B from 0 to 1; the reel's own without it.
+        background: color behind a lite model as R,G,B from 0 to 1; the reel's own without it.
         format: what pictures of a set are written as.
+        decoder_output: what the decoder of a bare full model (.ply with a .pt beside it) ends in; sigmoid without it.
         backend: which rasterizer.
     """
     if (camera is None) == (cameras is None):
@@ -58,7 +61,9 @@ def run(
     color = None if background is None else parse_color(background)
     one = read_camera(camera) if camera else None
     many = read_capture(cameras) if cameras else None
-    player = Player(file, backend)
+    player = Player(file, backend, decoder_output)
+    if color is not None and player.first.decoder is not None:
+        raise HoloreelError(f"--background: the decoder of {file} colors every pixel; leave it away.")
     moment = frame if time is None else player.frame_at(time)
     for sentence in player.report:
         print(f"note: {sentence}", file=sys.stderr)

@@ -193,7 +193,7 @@ def test_segments_must_hold_together(tmp_path, random_model, decoders):
         ([(full, other, 1, 4), (full, decoders[1], 5, 4)], "differ .full, clamp, none"),
         ([(full, other, 1, 4), (full, None, 5, 4)], "'segments.1..decoder' is None"),
         ([(lite, other, 1, 4)], "'decoder' is 'none', not null in a lite reel"),
-        ([], "'variant' is ''"),
+        ([], "'frame_count' is 0"),
     ]
     for parts, words in cases:
         with pytest.raises(HoloreelError, match=words):
