@@ -128,4 +128,5 @@ def coarser(found: Occupancy, factor: int) -> Occupancy:
     """Return which blocks of `factor`³ cells hold an occupied one; the last block of an axis may be cut."""
     padded = np.pad(found, [(0, -edge % factor) for edge in found.shape])
     x, y, z = (edge // factor for edge in padded.shape)
-    return padded.reshape(x, factor, y, factor, z, factor).any((1, 3, 5))
+    blocks = padded.reshape(x, factor, y, factor, z, factor).any((1, 3, 5))
+    return np.asarray(blocks)

@@ -1,0 +1,13 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+// Four lanes: SSE4.1, NEON, or whatever the compiler makes of vectors of four.
+#define HOLOREEL_LANES 4
+#define HOLOREEL_NAMESPACE narrow
+#include "march_rays.hpp"
+
+namespace holoreel {
+namespace videorf {
+
+const MarchKernels* narrow_march(int channels) { return narrow::march_of(channels); }
+
+}  // namespace videorf
+}  // namespace holoreel

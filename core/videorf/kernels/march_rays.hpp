@@ -1,0 +1,314 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+// The march itself. Included once by each width's translation unit, in a namespace of its own.
+//
+// A sample is the trilinear mean of the raw rows at its cell's corners; its density passes softplus after that, and absorbs
+// 1 - exp(-step softplus(density)). Samples in cells without an occupied corner see nothing. A ray ends once its transmittance
+// is not above the least one.
+#pragma once
+
+#include <algorithm>
+#include <cmath>
+#include <cstring>
+#include <limits>
+
+#include "march.hpp"
+#include "simd.hpp"
+
+namespace holoreel {
+namespace HOLOREEL_NAMESPACE {
+
+using namespace videorf;
+
+template <int C> struct RowOf;
+template <> struct RowOf<4> { typedef float type __attribute__((vector_size(16))); };
+template <> struct RowOf<8> { typedef float type __attribute__((vector_size(32))); };
+template <> struct RowOf<16> { typedef float type __attribute__((vector_size(64))); };
+
+template <int C> HOLOREEL_INLINE typename RowOf<C>::type load_row(const float* p) {
+    typename RowOf<C>::type row;
+    std::memcpy(&row, p, sizeof row);
+    return row;
+}
+template <int C> HOLOREEL_INLINE void store_row(float* p, typename RowOf<C>::type row) { std::memcpy(p, &row, sizeof row); }
+template <int C> HOLOREEL_INLINE float sum_row(typename RowOf<C>::type row) {
+    float sum = 0;
+    for (int c = 0; c < C; c++) sum += row[c];
+    return sum;
+}
+
+// Up to kBatch samples, those in occupied cells only.
+struct Batch {
+    int count;
+    alignas(32) int32_t cell[kBatch];
+    alignas(32) float x[kBatch], y[kBatch], z[kBatch], t[kBatch];  // t: from the entry into the lattice, in spacings
+    alignas(32) float density[kBatch], alpha[kBatch], passed[kBatch], slope[kBatch];
+};
+
+// One ray in the lattice's own coordinates.
+class Walk {
+public:
+    Walk(const Volume& volume, const VideorfRays& rays, int64_t ray) : volume_(volume) {
+        const float* origin = rays.origins + 3 * ray;
+        const float* direction = rays.directions + 3 * ray;
+        double o[3], near = 0, far = 1e9;
+        bool hit = true;
+        for (int a = 0; a < 3; a++) {
+            hit = hit && std::isfinite(origin[a]) && std::isfinite(direction[a]);
+            o[a] = (double(origin[a]) - volume.lowest[a]) / volume.spacing;
+            const double d = direction[a];
+            if (std::abs(d) < 1e-12) {
+                hit = hit && o[a] >= 0 && o[a] <= volume.cells[a];
+                continue;
+            }
+            const double first = (0 - o[a]) / d, second = (volume.cells[a] - o[a]) / d;
+            near = std::max(near, std::min(first, second));
+            far = std::min(far, std::max(first, second));
+        }
+        step_ = static_cast<float>(rays.step);
+        jitter_ = rays.jitter ? rays.jitter[ray] : 0.5f;
+        entry = near;
+        const double steps = (far - near) / rays.step - jitter_;
+        samples_ = hit && steps > 0 && steps < 1e7 ? static_cast<int>(std::ceil(steps)) : 0;
+        for (int a = 0; a < 3; a++) {
+            start_[a] = static_cast<float>(o[a] + near * direction[a]);
+            direction_[a] = direction[a];
+            inverse_[a] = std::abs(direction[a]) < 1e-12f ? 0.0f : 1.0f / direction[a];
+            limit_[a] = static_cast<float>(volume.cells[a]);
+        }
+    }
+
+    // Fills `batch` with the next samples; false at the end of the ray. Samples come in order.
+    HOLOREEL_INLINE_MEMBER bool next(Batch& batch) {
+        while (next_ < samples_) {
+            if (skip()) continue;
+            collect(batch);
+            if (batch.count) return true;
+        }
+        return false;
+    }
+
+    double entry;  // where the ray enters, in spacings from its origin
+
+private:
+    HOLOREEL_INLINE_MEMBER int cell_at(int axis, float t) const {
+        const float p = std::min(std::max(start_[axis] + t * direction_[axis], 0.0f), limit_[axis]);
+        return std::min(static_cast<int>(p), volume_.cells[axis] - 1);
+    }
+
+    // Moves on to the end of an empty brick or block. Never past a sample beyond it: where in doubt, one step at a time.
+    HOLOREEL_INLINE_MEMBER bool skip() {
+        const float t = (static_cast<float>(next_) + jitter_) * step_;
+        const int x = cell_at(0, t), y = cell_at(1, t), z = cell_at(2, t);
+        const Volume& v = volume_;
+        if (v.brick_of[(size_t(x / kBrick) * v.bricks[1] + y / kBrick) * v.bricks[2] + z / kBrick]) return false;
+        const bool far = !v.block_full[(size_t(x / kBlock) * v.blocks[1] + y / kBlock) * v.blocks[2] + z / kBlock];
+        const int edge = far ? kBlock : kBrick;
+        const int at[3] = {x & -edge, y & -edge, z & -edge};
+        float leave = std::numeric_limits<float>::max();
+        for (int a = 0; a < 3; a++) {
+            if (inverse_[a] == 0) continue;
+            const float wall = static_cast<float>(inverse_[a] > 0 ? at[a] + edge : at[a]);
+            leave = std::min(leave, (wall - start_[a]) * inverse_[a]);
+        }
+        const float to = std::min(leave / step_ - jitter_, static_cast<float>(samples_));
+        next_ = std::max(next_ + 1, static_cast<int>(to));
+        return true;
+    }
+
+    HOLOREEL_INLINE_MEMBER void collect(Batch& batch) {
+        alignas(32) float x[kBatch], y[kBatch], z[kBatch], t[kBatch];
+        alignas(32) int32_t cell[kBatch];
+        const int32_t* bricks = volume_.brick_of.data();
+        const int32_t* cells = volume_.cell_of.data();
+        const int limit_x = volume_.cells[0] - 1, limit_y = volume_.cells[1] - 1, limit_z = volume_.cells[2] - 1;
+        const int stride_x = volume_.bricks[1] * volume_.bricks[2], stride_y = volume_.bricks[2];
+        for (int i = 0; i < kBatch; i++) {
+            t[i] = (static_cast<float>(next_ + i) + jitter_) * step_;
+            const float px = std::min(std::max(start_[0] + t[i] * direction_[0], 0.0f), limit_[0]);
+            const float py = std::min(std::max(start_[1] + t[i] * direction_[1], 0.0f), limit_[1]);
+            const float pz = std::min(std::max(start_[2] + t[i] * direction_[2], 0.0f), limit_[2]);
+            const int ix = std::min(static_cast<int>(px), limit_x);
+            const int iy = std::min(static_cast<int>(py), limit_y);
+            const int iz = std::min(static_cast<int>(pz), limit_z);
+            x[i] = px - static_cast<float>(ix);
+            y[i] = py - static_cast<float>(iy);
+            z[i] = pz - static_cast<float>(iz);
+            const int brick = bricks[(ix >> 2) * stride_x + (iy >> 2) * stride_y + (iz >> 2)];
+            cell[i] = cells[brick + ((ix & 3) << 4 | (iy & 3) << 2 | (iz & 3))];
+        }
+        const int left = std::min(samples_ - next_, kBatch);
+        int n = 0;
+        for (int i = 0; i < left; i++) {
+            batch.cell[n] = cell[i];
+            batch.x[n] = x[i];
+            batch.y[n] = y[i];
+            batch.z[n] = z[i];
+            batch.t[n] = t[i];
+            n += cell[i] >= 0;
+        }
+        batch.count = n;
+        next_ += kBatch;
+    }
+
+    const Volume& volume_;
+    float start_[3], direction_[3], inverse_[3], limit_[3];
+    float step_, jitter_;
+    int next_ = 0, samples_;
+};
+
+template <int C>
+HOLOREEL_INLINE typename RowOf<C>::type interpolate(const float* table, const int32_t* corner, float x, float y, float z) {
+    using Row = typename RowOf<C>::type;
+    const auto row = [&](int i) { return load_row<C>(table + size_t(corner[i]) * C); };
+    const auto along = [&](int i) -> Row {
+        const Row a = row(i);
+        return a + (row(i + 1) - a) * z;
+    };
+    const Row a = along(0), b = along(4);
+    const Row near = a + (along(2) - a) * y, far = b + (along(6) - b) * y;
+    return near + (far - near) * x;
+}
+
+// alpha = 1 - exp(-step softplus(d)), passed = exp(-step softplus(d)) and, for the backward pass, slope = step sigmoid(d).
+template <bool kSlope> HOLOREEL_INLINE void activate(Batch& batch, float step) {
+    const F log2e = set1(1.44269504f), one = set1(1.0f), zero = set1(0.0f);
+    for (int i = 0; i < kBatch; i += kLanes) {
+        const F d = load(batch.density + i);
+        const F e = exp2(negate(mul(min(abs(d), set1(60.0f)), log2e)));
+        const F z = div(e, add(e, set1(2.0f))), zz = mul(z, z);  // log1p(e) = 2 atanh(e / (2 + e))
+        F series = fma(zz, set1(2.0f / 13), set1(2.0f / 11));
+        series = fma(series, zz, set1(2.0f / 9));
+        series = fma(series, zz, set1(2.0f / 7));
+        series = fma(series, zz, set1(2.0f / 5));
+        series = fma(series, zz, set1(2.0f / 3));
+        series = fma(series, zz, set1(2.0f));
+        const F tau = mul(fma(series, z, max(d, zero)), set1(step));
+        const F passed = exp2(negate(mul(min(tau, set1(60.0f)), log2e)));
+        // 1 - passed would lose the digits of a thin sample.
+        const F thin = mul(tau, fma(tau, fma(tau, set1(1.0f / 6), set1(-0.5f)), one));
+        store(batch.passed + i, passed);
+        store(batch.alpha + i, select(gt(set1(0.02f), tau), thin, sub(one, passed)));
+        if (kSlope) store(batch.slope + i, mul(set1(step), div(select(ge(d, zero), one, e), add(one, e))));
+    }
+}
+
+template <int C, bool kSlope, class Rows>
+HOLOREEL_INLINE void sample(const March& march, Batch& batch, Rows& rows) {
+    const int32_t* corners = march.volume->corners.data();
+    for (int i = 0; i < batch.count; i++)
+        rows[i] = interpolate<C>(march.table, corners + 8 * size_t(batch.cell[i]), batch.x[i], batch.y[i], batch.z[i]);
+    for (int i = 0; i < kBatch; i++) batch.density[i] = i < batch.count ? rows[i][0] : 0.0f;
+    activate<kSlope>(batch, static_cast<float>(march.rays.step));
+}
+
+template <int C> int64_t forward_rays(const March& march, int64_t first, int64_t last) {
+    using Row = typename RowOf<C>::type;
+    const float least = static_cast<float>(march.rays.transmittance_min);
+    int64_t samples = 0;
+    Batch batch;
+    Row rows[kBatch];
+    for (int64_t ray = first; ray < last; ray++) {
+        Walk walk(*march.volume, march.rays, ray);
+        Row sum = {};
+        float left = 1, distance = 0;
+        bool open = true;
+        while (open && walk.next(batch)) {
+            sample<C, false>(march, batch, rows);
+            for (int i = 0; i < batch.count && open; i++, samples++) {
+                const float weight = left * batch.alpha[i];
+                sum += rows[i] * weight;
+                distance += weight * batch.t[i];
+                left *= batch.passed[i];
+                open = left > least;
+            }
+        }
+        const float weights = 1 - left;
+        sum[0] = left;
+        store_row<C>(march.images.accumulated + C * ray, sum);
+        march.images.depth[ray] =
+            static_cast<float>((distance + weights * walk.entry) * march.volume->spacing);
+    }
+    return samples;
+}
+
+// What the way back needs of a sample.
+struct Step {
+    float weight, after, seen, slope;  // seen: what the loss gains per weight
+};
+
+template <int C> void backward_rays(const March& march, int64_t first, int64_t last, Chunk& chunk) {
+    using Row = typename RowOf<C>::type;
+    static thread_local std::vector<Step> steps;
+    const float least = static_cast<float>(march.rays.transmittance_min);
+    const VideorfImageGradients& gradients = march.gradients;
+    chunk.records.clear();
+    Batch batch;
+    Row rows[kBatch];
+    for (int64_t ray = first; ray < last; ray++) {
+        Walk walk(*march.volume, march.rays, ray);
+        Row incoming = {};
+        if (gradients.accumulated) incoming = load_row<C>(gradients.accumulated + C * ray);
+        const float d_left = incoming[0];
+        incoming[0] = 0;
+        const float d_distance =
+            gradients.depth ? static_cast<float>(gradients.depth[ray] * march.volume->spacing) : 0.0f;
+        const float entry = static_cast<float>(walk.entry);
+        float left = 1;
+        bool open = true;
+        steps.clear();
+        while (open && walk.next(batch)) {
+            sample<C, true>(march, batch, rows);
+            for (int i = 0; i < batch.count && open; i++) {
+                const float weight = left * batch.alpha[i];
+                left *= batch.passed[i];
+                open = left > least;
+                const float seen = sum_row<C>(rows[i] * incoming) + d_distance * (entry + batch.t[i]);
+                steps.push_back({weight, left, seen, batch.slope[i]});
+                chunk.records.push_back(
+                    {batch.cell[i], batch.x[i], batch.y[i], batch.z[i], weight, 0, static_cast<int32_t>(ray)});
+            }
+        }
+        // A denser sample takes light from all behind it, and from the background.
+        float behind = d_left * left;
+        Record* record = chunk.records.data() + chunk.records.size();
+        for (size_t k = steps.size(); k-- > 0;) {
+            const Step& step = steps[k];
+            (--record)->density = (step.after * step.seen - behind) * step.slope;
+            behind += step.weight * step.seen;
+        }
+    }
+    chunk.samples = static_cast<int64_t>(chunk.records.size());
+}
+
+template <int C> void scatter_shard(const March& march, int shard, const Chunk* chunks, int64_t count, float* gradient) {
+    using Row = typename RowOf<C>::type;
+    const Volume& volume = *march.volume;
+    const int from = shard * volume.shard_rows, to = std::min(from + volume.shard_rows, volume.rows - 1);
+    alignas(64) float elsewhere[C] = {};  // takes what belongs to other shards and to the empty row
+    for (const Chunk* chunk = chunks; chunk < chunks + count; chunk++) {
+        for (uint32_t i = chunk->begin[shard]; i < chunk->begin[shard + 1]; i++) {
+            const Record& record = chunk->records[chunk->order[i]];
+            Row row = {};
+            if (march.gradients.accumulated)
+                row = load_row<C>(march.gradients.accumulated + size_t(record.ray) * C) * record.weight;
+            row[0] = record.density;
+            const int32_t* corner = volume.corners.data() + 8 * size_t(record.cell);
+            const float wx[2] = {1 - record.x, record.x}, wy[2] = {1 - record.y, record.y};
+            const float wz[2] = {1 - record.z, record.z};
+            for (int k = 0; k < 8; k++) {
+                float* target = corner[k] >= from && corner[k] < to ? gradient + size_t(corner[k]) * C : elsewhere;
+                store_row<C>(target, load_row<C>(target) + row * (wx[k >> 2] * wy[k >> 1 & 1] * wz[k & 1]));
+            }
+        }
+    }
+}
+
+static const MarchKernels* march_of(int channels) {
+    static const MarchKernels four = {kLanes, forward_rays<4>, backward_rays<4>, scatter_shard<4>};
+    static const MarchKernels eight = {kLanes, forward_rays<8>, backward_rays<8>, scatter_shard<8>};
+    static const MarchKernels sixteen = {kLanes, forward_rays<16>, backward_rays<16>, scatter_shard<16>};
+    return channels == 4 ? &four : channels == 8 ? &eight : channels == 16 ? &sixteen : nullptr;
+}
+
+}  // namespace HOLOREEL_NAMESPACE
+}  // namespace holoreel

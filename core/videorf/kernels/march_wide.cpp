@@ -1,0 +1,29 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+// Eight lanes. This file alone is compiled with AVX2 and FMA; elsewhere than on x86 it is empty.
+#include "march.hpp"
+
+#if defined(__AVX2__) && defined(__FMA__)
+
+#define HOLOREEL_LANES 8
+#define HOLOREEL_NAMESPACE wide
+#include "march_rays.hpp"
+
+namespace holoreel {
+namespace videorf {
+
+const MarchKernels* wide_march(int channels) { return wide::march_of(channels); }
+
+}  // namespace videorf
+}  // namespace holoreel
+
+#else
+
+namespace holoreel {
+namespace videorf {
+
+const MarchKernels* wide_march(int) { return nullptr; }
+
+}  // namespace videorf
+}  // namespace holoreel
+
+#endif

@@ -1,0 +1,126 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The compiled ray march, forward and backward. float32, on the processor.
+
+While it trains, call `torch.set_num_threads(1)`: torch's own threads spin between calls and take the cores from the
+march.
+"""
+
+import ctypes
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from ..errors import HoloreelError
+from .field import DEFAULT_RULES, FieldLattice, Marched, MarchRules, Rays, check_march
+from .native import CImages, CLattice, CRays, load_kernels
+
+WIDTHS = (4, 8, 16)  # channels the kernels are built for; others are padded with zeros, at the cost of a copy
+
+
+class Volume:
+    """A lattice made ready for the march: bricks of cells, and every occupied cell's eight rows. Keep it for its
+    group.
+    """
+
+    def __init__(self, field: FieldLattice) -> None:
+        """Raise `HoloreelError` where the lookup names a row that the table does not have."""
+        lookup = np.ascontiguousarray(field.lookup, np.int32)
+        lattice = field.lattice
+        c_lattice = CLattice(
+            (ctypes.c_int32 * 3)(*lattice.shape),
+            field.rows,
+            (ctypes.c_double * 3)(*lattice.lowest),
+            lattice.spacing,
+            lookup.ctypes.data,
+        )
+        self.field = field
+        self.library = load_kernels()
+        self.handle = self.library.videorf_volume_new(c_lattice)
+        if not self.handle:
+            raise HoloreelError(f"The lattice cannot be used: {self.library.videorf_last_error().decode()}.")
+
+    def __del__(self) -> None:
+        if getattr(self, "handle", None):
+            self.library.videorf_volume_free(self.handle)
+
+    @property
+    def cells(self) -> int:
+        """How many cells are occupied."""
+        return self.library.videorf_volume_cells(self.handle)
+
+
+def march(volume: Volume, table: Tensor, rays: Rays, rules: MarchRules = DEFAULT_RULES) -> Marched:
+    """Sum the field's features along rays, as `field` says. Gradients reach the table; its last row gets none.
+
+    They are the same bits for any number of threads.
+    """
+    check_march(volume.field, table, rays)
+    channels = table.shape[1]
+    width = next(width for width in WIDTHS if width >= channels)
+    padded = torch.nn.functional.pad(table, (0, width - channels)) if width > channels else table
+    plain = Rays(*(None if part is None else _plain(part) for part in rays))  # type: ignore[arg-type]
+    accumulated, depth = _March.apply(volume, plain, rules, _plain(padded))
+    return Marched(accumulated[:, 1:channels], accumulated[:, 0], depth)
+
+
+def count_samples(volume: Volume, table: Tensor, rays: Rays, rules: MarchRules = DEFAULT_RULES) -> int:
+    """Return how many samples the march of these rays takes, all in occupied cells."""
+    check_march(volume.field, table, rays)
+    padded = torch.nn.functional.pad(table, (0, next(w for w in WIDTHS if w >= table.shape[1]) - table.shape[1]))
+    plain = Rays(*(None if part is None else _plain(part) for part in rays))  # type: ignore[arg-type]
+    return _forward(volume, plain, rules, _plain(padded.detach()))[2]
+
+
+def _plain(tensor: Tensor) -> Tensor:
+    return tensor.to("cpu", torch.float32).contiguous()
+
+
+def _address(tensor: Tensor | None) -> int | None:
+    return None if tensor is None else tensor.data_ptr()
+
+
+def _c_rays(rays: Rays, rules: MarchRules) -> CRays:
+    pointers = map(_address, (rays.origins, rays.directions, rays.jitter))
+    return CRays(len(rays.origins), *pointers, rules.step, rules.transmittance_min)
+
+
+def _forward(volume: Volume, rays: Rays, rules: MarchRules, table: Tensor) -> tuple[Tensor, Tensor, int]:
+    accumulated = torch.empty(len(rays.origins), table.shape[1])
+    depth = torch.empty(len(rays.origins))
+    images = CImages(_address(accumulated), _address(depth))
+    samples = ctypes.c_int64()
+    arguments = volume.handle, _address(table), table.shape[1], _c_rays(rays, rules), images, samples
+    if volume.library.videorf_forward(*arguments) != 0:
+        raise HoloreelError(f"The rays cannot be marched: {volume.library.videorf_last_error().decode()}.")
+    return accumulated, depth, samples.value
+
+
+class _March(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, volume: Volume, rays: Rays, rules: MarchRules, table: Tensor) -> tuple[Tensor, Tensor]:
+        ctx.volume, ctx.rays, ctx.rules = volume, rays, rules
+        ctx.save_for_backward(table)
+        ctx.set_materialize_grads(False)
+        return _forward(volume, rays, rules, table)[:2]
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, *gradients: Tensor | None) -> tuple[Tensor | None, ...]:
+        (table,) = ctx.saved_tensors
+        accumulated, depth = (None if gradient is None else _plain(gradient) for gradient in gradients)
+        gradient = torch.empty_like(table)
+        status = ctx.volume.library.videorf_backward(
+            ctx.volume.handle,
+            _address(table),
+            table.shape[1],
+            _c_rays(ctx.rays, ctx.rules),
+            CImages(_address(accumulated), _address(depth)),
+            _address(gradient),
+        )
+        if status != 0:
+            reason = ctx.volume.library.videorf_last_error().decode()
+            raise HoloreelError(f"The gradient of the rays cannot be computed: {reason}.")
+        return None, None, None, gradient
