@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from holoreel.core.blender import find_blender, run_in_blender
 from holoreel.core.camera import Camera
-from holoreel.core.capture import LAYOUTS, Capture, CaptureOptions, read_capture
+from holoreel.core.capture import LAYOUTS, Capture, CaptureOptions, Points, read_capture, write_points
 from holoreel.core.capture.colmap_model import write_model
 from holoreel.core.capture.convert import convert
 from holoreel.core.capture.export import Export
@@ -21,6 +21,7 @@ from holoreel.core.capture.n3v import camera_of, read_poses, row_of
 from holoreel.core.capture.resample import lens_map
 from holoreel.core.cli import main
 from holoreel.core.errors import HoloreelError
+from holoreel.core.files import write_json
 from holoreel.core.rig import RigRequest
 from holoreel.core.synth import SynthJob, synthesize
 
@@ -360,3 +361,75 @@ def test_scale_must_divide(small: Capture) -> None:
 
     with pytest.raises(HoloreelError, match="161x120, which --scale 2 does not divide"):
         finish(odd, CaptureOptions(scale=2), LAYOUTS["videos"])
+
+
+def test_rectified_fisheyes_are_what_a_pinhole_sees(
+    small: Capture, fisheye: tuple[Capture, Path], tmp_path: Path
+) -> None:
+    """The undistorted protocol: pictures of half the focal length, black where the fisheye saw nothing."""
+    out = tmp_path / "out"
+    command = ["convert", str(fisheye[1]), "--out", str(out), "--to", "nerfstudio", "--rectify", "0.5", "--scale", "1"]
+    assert main(command) == 0
+    back = read_capture(out)
+    assert back.camera_names("test") == ["camera_0001"]
+    for old, new in IMMERSIVE.items():
+        lens, camera = fisheye[0].cameras[old], back.cameras[new]
+        assert (camera.model, camera.cx, camera.cy) == ("PINHOLE", lens.cx, lens.cy)
+        assert camera.fx == pytest.approx(lens.fx / 2)
+        seen = lens_map(lens, camera).seen
+        assert 0.2 < seen.mean() < 0.9
+        expected = lens_map(small.cameras[old], camera).apply(small.image(old, 1, (0, 0, 0)))
+        picture = back.image(new, 1, (0, 0, 0))
+        assert psnr(picture[seen], expected[seen]) > 30
+        assert not picture[~seen].any()
+    assert main([*command[:-4], "--rectify", "0"]) == 2
+
+
+def write_sfm(folder: Path, cameras: list[Camera], frames: int, start: int = 0) -> None:
+    """Write what `holoreel sfm` would: for frame j a point at (start + j, 0, 0)."""
+    found = []
+    for j in range(frames):
+        write_points(folder / f"points_{j:04d}.ply", Points(np.float32([[start + j, 0, 0]]), np.uint8([[1, 2, 3]])))
+        found.append({"index": j, "file": f"points_{j:04d}.ply", "points": 1})
+    meta = {"version": 1, "frame_start": start, "frame_count": frames, "posed": "sfm", "frames": found}
+    write_json(folder / "sfm.json", meta | {"cameras": [camera.to_json() for camera in cameras]})
+
+
+def test_structure_from_motion_is_attached(small: Capture, tmp_path: Path) -> None:
+    """Videos without a calibration get their cameras from it, and frames keep their points when some are chosen."""
+    there_and_back(small, "videos", tmp_path)
+    scene = tmp_path / "scene"
+    (scene / "cameras_opencv.json").unlink()
+    registered = [small.cameras["cam01"], small.cameras["cam02"]]  # cam00 could not be placed
+    write_sfm(scene / "sfm", registered, 3)
+    capture = read_capture(scene, frames="1:2", scale=2, frame_start=40)
+    assert list(capture.cameras) == ["cam01", "cam02"]
+    assert capture.camera_names("test") == ["cam01"]
+    assert capture.frame_start == 40
+    assert capture.cameras["cam02"].width == 80
+    np.testing.assert_allclose(capture.cameras["cam02"].world_to_camera, small.cameras["cam02"].world_to_camera)
+    assert [capture.seed_points(j).xyz[0, 0] for j in range(2)] == [1, 2]
+    (scene / "sfm").rename(tmp_path / "elsewhere")
+    with pytest.raises(HoloreelError, match="holoreel sfm"):
+        read_capture(scene)
+    assert read_capture(scene, sfm=tmp_path / "elsewhere").seeds.keys() == {0, 1, 2}
+
+
+def test_real_webcams(shared_data: Callable[[str], Path], tmp_path: Path) -> None:
+    """Four webcams with jittery timestamps: both forms of their calibration say the same, and the clock fits."""
+    folder = shared_data("capture_webcams")
+    capture = read_capture(folder, scale=4)
+    assert (capture.frame_count, len(capture.views())) == (57, 4 * 57)
+    assert capture.fps == pytest.approx(6.0, abs=0.01)
+    assert capture.camera_names("test") == ["cam_0"]
+    assert all(capture.images[name, j].index == j for name, j in capture.images)
+    assert "57 frames on a common clock of 166.6" in capture.notes[0]
+    assert capture.image("cam_3", 56).shape == (180, 320, 3)
+    again = read_capture(folder, scale=4, calibration=folder / "cameras_opencv.json")
+    for name, camera in capture.cameras.items():
+        assert camera.model == "FULL_OPENCV"
+        assert camera.distortion == again.cameras[name].distortion
+        np.testing.assert_allclose(camera.world_to_camera, again.cameras[name].world_to_camera, atol=1e-12)
+        np.testing.assert_allclose(camera.K, again.cameras[name].K)
+    with pytest.raises(HoloreelError, match=r"camera cam_2 is \+18.1 ms from the common clock.*--sync-tolerance 0.11"):
+        read_capture(folder, sync_tolerance=0.05)
