@@ -8,7 +8,8 @@ from typing import Annotated, Literal
 import tyro
 from tqdm import tqdm
 
-from ..capture import read_capture
+from ..capture import Capture, CaptureOptions, read_capture
+from ..draw import Backend
 from ..errors import HoloreelError
 from ..gaussians.config import PRESETS, TrainConfig
 from ..gaussians.run import RunPaths, train_reel
@@ -34,41 +35,47 @@ def prepare(arguments: list[str]) -> Callable[..., None]:
         out: Path,
         preset: str = preset,
         resume: bool = False,
-        backend: Literal["auto", "cpu", "reference"] = "auto",
+        backend: Backend = "auto",
+        options: Annotated[CaptureOptions, tyro.conf.arg(name="")] = CaptureOptions(),  # noqa: B008
         config: Annotated[TrainConfig, tyro.conf.arg(name="")] = PRESETS[preset],
     ) -> None:
         """Train a reel from a capture. Ctrl-C leaves a checkpoint beside the reel.
 
         Args:
             method: what to train: stg, Spacetime Gaussians.
-            capture: folder with transforms.json, or that file.
+            capture: folder of a capture in any layout that `holoreel info` knows.
             out: the reel to write, NAME.reel.
             preset: settings to start from; the flags below change them.
             resume: go on from the checkpoint of a stopped run.
             backend: which rasterizer.
+            options: how the capture is read.
             config: the preset's settings.
         """
-        train(capture, out, resume, backend, config)
+        train(read_capture(capture, options), out, resume, backend, config)
 
     return run
 
 
-def train(
-    capture: Path, out: Path, resume: bool, backend: Literal["auto", "cpu", "reference"], config: TrainConfig
-) -> None:
+def train(capture: Capture, out: Path, resume: bool, backend: Backend, config: TrainConfig) -> None:
     """Train with a progress line on the terminal."""
-    with tqdm(total=config.iterations, unit="it", dynamic_ncols=True, desc="train") as bar:
+    for note in capture.notes:
+        print(note)
+    with tqdm(unit="it", dynamic_ncols=True, desc="train") as bar:
 
         def show(progress: Progress) -> None:
-            bar.n = progress.iteration
+            bar.n, bar.total = progress.iteration, progress.iterations
             bar.set_postfix(
                 loss=f"{progress.loss:.4f}", psnr=f"{progress.psnr:.2f}", gaussians=progress.gaussians, refresh=True
             )
 
         try:
-            trainer = train_reel(read_capture(capture), out, config, get_backend(backend), show, resume)
+            trained = train_reel(capture, out, config, get_backend(backend), show, resume)
         except KeyboardInterrupt:
             bar.close()
             print(f"checkpoint: {RunPaths(out).checkpoint} (go on with --resume)")
             raise
-    print(f"{out}: {len(trainer.parameters)} Gaussians in {trainer.seconds:.0f} s")
+    segments = len(trained.reel.segments)
+    print(
+        f"{out}: {trained.gaussians} Gaussians{f' in {segments} segments' if segments > 1 else ''}, "
+        f"trained in {trained.seconds:.0f} s"
+    )

@@ -114,10 +114,10 @@ def _synthesize(settings: DemoSettings, show: OnProgress) -> None:
 
 def _train(settings: DemoSettings, capture: Capture, reel: Path, results: Results, show: OnProgress) -> None:
     config = replace(PRESETS["lite"], iterations=settings.iterations)
-    trainer = train_reel(
+    trained = train_reel(
         capture, reel, config, get_backend(), lambda progress: show(progress.iteration, progress.iterations)
     )
-    results.gaussians, results.train_seconds = len(trainer.parameters), round(trainer.seconds, 2)
+    results.gaussians, results.train_seconds = trained.gaussians, round(trained.seconds, 2)
 
 
 def _evaluate(reel: Path, capture: Capture, results: Results, folder: Path, show: OnProgress) -> None:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from ..capture import Points
 from .config import TrainConfig
 from .model import SpacetimeGaussians, concatenate
-from .seeds import gaussians_from_points
+from .seeds import as_trained, gaussians_from_points
 
 STATIC_WIDTH = 0.5  # segments: one that lives shorter has to do with something that happens
 STATIC_DRIFT = 1.5  # footprints that a still Gaussian may move over its segment
@@ -112,7 +112,7 @@ def warm_seeds(
     """
     from scipy.spatial import cKDTree
 
-    fresh = gaussians_from_points(points, config, rng)
+    fresh = as_trained(gaussians_from_points(points, config, rng), config)
     if not len(static):
         return fresh
     distance = cKDTree(static.means).query(fresh.means, workers=-1)[0]
