@@ -1,20 +1,35 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """The trained tensors with their Adam moments, which grow and shrink together under density control."""
 
+import math
 from collections.abc import Mapping
 from types import ModuleType
+from typing import NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from ..render.contract import DensityStats, SpacetimeTensors
+from ..render.contract import AdamGroup, DensityStats, SpacetimeTensors
 from .model import SpacetimeGaussians
 from .scale import Measure
 
 BETAS = (0.9, 0.999)
 EPSILON = 1e-15  # gradients of a mean loss over a picture are tiny; the usual 1e-8 would damp the step
 ROW_STATE = ("gradient", "views", "radius_px")  # of density control
+
+
+class Rate(NamedTuple):
+    """How far one tensor steps: `rate`, times a factor per row and one per value of a row; then it is held in a range.
+
+    With the rate 0 it stays as it is.
+    """
+
+    rate: float
+    rows: Tensor | None = None
+    columns: Tensor | None = None
+    low: float = -math.inf
+    high: float = math.inf
 
 
 def _ones(means: Tensor) -> Tensor:
@@ -61,25 +76,15 @@ class Parameters:
         """Copy the values out."""
         return SpacetimeGaussians(**{name: value.detach().numpy().copy() for name, value in self.tensors.items()})
 
-    def step(self, rates: Mapping[str, float | Tensor], backend: ModuleType) -> None:
-        """Take one Adam step with a learning rate per tensor, and clear the gradients.
-
-        A rate may be a tensor that is broadcast against the parameter. What has the rate 0 stays as it is.
-        """
+    def step(self, rates: Mapping[str, Rate], backend: ModuleType) -> None:
+        """Take one Adam step with a learning rate per tensor, and clear the gradients."""
         self.steps += 1
-        with torch.no_grad():
-            for name, value in (*self.tensors.items(), *self.network.items()):
-                rate, gradient = rates[name], value.grad
-                value.grad = None
-                if gradient is None or (isinstance(rate, float) and rate == 0.0):
-                    continue
-                moments = (self.first[name], self.second[name])
-                if isinstance(rate, Tensor):  # the step in units of the rate, which then scales it
-                    step = torch.zeros_like(value)
-                    backend.adam_step(step, gradient, *moments, 1.0, *BETAS, EPSILON, self.steps)
-                    value.addcmul_(step, rate)
-                else:
-                    backend.adam_step(value, gradient, *moments, rate, *BETAS, EPSILON, self.steps)
+        groups = []
+        for name, value in (*self.tensors.items(), *self.network.items()):
+            gradient, value.grad, rate = value.grad, None, rates[name]
+            if gradient is not None and rate.rate != 0.0:
+                groups.append(AdamGroup(value.detach(), gradient, self.first[name], self.second[name], *rate))
+        backend.adam(groups, *BETAS, EPSILON, self.steps)
 
     def refresh_units(self) -> None:
         """Measure the unit of length again where the Gaussians are now."""

@@ -26,7 +26,7 @@ from .density import SETTINGS, DensityControl
 from .guided import Patches, Stability, depth_range, measure_patches, new_gaussians, sample_rays, worst_patches
 from .mcmc import McmcControl
 from .model import SpacetimeGaussians
-from .parameters import Parameters
+from .parameters import Parameters, Rate
 from .scale import measure_scene
 from .seeds import as_trained, gaussians_from_points
 
@@ -154,6 +154,8 @@ class Trainer:
             )
         self.scene = measure_scene(capture, xyz)
         self.measure = self.scene.footprints if config.unit == "footprint" else self.scene.extents
+        # Ray origins are the network's one input in world units; this makes them comparable with the others.
+        self._origin_scale = 1.0 / max(float(self.scene.centers.norm(dim=1).max()), self.scene.nearest * 1e-3)
         self.times = torch.tensor(capture.times, dtype=torch.float32)
         self.background = torch.tensor(config.background)
         # What is too near to a camera to stay must not be too near to be seen.
@@ -189,12 +191,8 @@ class Trainer:
             return {name: torch.from_numpy(getattr(decoder, name)) for name in SHAPES}
         bound = 1.0 / math.sqrt(SHAPES["hidden"][1])
         hidden = (2.0 * torch.rand(SHAPES["hidden"], generator=self.rng) - 1.0) * bound
-        hidden[:, 6:9] *= self._origin_scale()
+        hidden[:, 6:9] *= self._origin_scale
         return {"hidden": hidden, "output": torch.zeros(SHAPES["output"])}
-
-    def _origin_scale(self) -> float:
-        """Return what makes ray origins, the network's one input in world units, comparable with the others."""
-        return 1.0 / max(float(self.scene.centers.norm(dim=1).max()), self.scene.nearest * 1e-3)
 
     def run(self, on_progress: Callable[[Progress], None], until: int | None = None, every: int = 20) -> None:
         """Train up to iteration `until` (default: to the end), reporting every few iterations.
@@ -239,9 +237,6 @@ class Trainer:
             width = max(width, self.capture.cameras[view[0]].width)
         self.control.before_step(self.parameters)
         self.parameters.step(self._rates(), self.backend)
-        if self.config.clamp_colors and self.config.model == "lite":
-            with torch.no_grad():
-                self.parameters.tensors["features"].clamp_(0.0, 1.0)
         self.iteration += 1
         with torch.no_grad():
             self._control_number(loss, 0.5 * width * self.config.batch)
@@ -250,21 +245,22 @@ class Trainer:
     def _learn(self, view: View, picture: np.ndarray) -> tuple[float, float]:
         """Render one view, compare it, and add to the gradients."""
         camera = self.capture.cameras[view[0]]
-        target = torch.from_numpy(picture).to(torch.float32).mul_(1.0 / 255.0)
+        target = torch.from_numpy(picture)
         rendering = self.render(camera, self.capture.time(view[1]), training=True)
         colors, valid = rendering.features, valid_pixels(camera)
         if valid is not None:  # equal outside, so that nothing is learned there
             colors, target = colors * valid[..., None], target * valid[..., None]
-        loss = self.backend.l1_dssim(colors, target, self.config.dssim_weight)
+        loss, squared_error = self.backend.picture_loss(colors, target, self.config.dssim_weight)
         value = float(loss.detach())
         if not math.isfinite(value):
             raise HoloreelError(
                 f"{self.capture.source}: the loss is not finite at iteration {self.iteration + 1} (camera "
                 f"{view[0]!r}, frame {view[1]}); lower the learning rates, --rates.means and --rates.scales first."
             )
-        (loss / self.config.batch).backward()
-        mse = float((colors.detach() - target).square().mean())
-        return value, mse if valid is None else mse / max(float(valid.to(torch.float32).mean()), 1e-6)
+        (loss if self.config.batch == 1 else loss / self.config.batch).backward()
+        if valid is not None:
+            squared_error /= max(float(valid.to(torch.float32).mean()), 1e-6)
+        return value, squared_error
 
     def render(self, camera: Camera, time: float, training: bool = False) -> Rendering:
         """Render what has been learned as a camera sees it at a normalized time: colors (H, W, 3), alpha, depth."""
@@ -286,29 +282,30 @@ class Trainer:
         rates = self.config.rates
         return (rates.means_final / rates.means) ** (self.iteration / self.config.planned)
 
-    def _rates(self) -> dict[str, float | Tensor]:
+    def _rates(self) -> dict[str, Rate]:
         """Return the learning rate of each tensor at this iteration."""
         config, rates, units = self.config, self.config.rates, self.parameters.units
         decay = rates.final_factor ** (self.iteration / config.planned)
-        orders = (torch.arange(3) < config.motion).to(torch.float32)[:, None]
-        features: float | Tensor = rates.features * decay
-        if config.model == "full":
-            features = torch.tensor([rates.features * decay] * 6 + [rates.features_time * decay] * 3)
+        orders = (torch.arange(9) // 3 < config.motion).to(torch.float32)
+        if config.model == "lite":
+            colors = Rate(rates.features * decay, *((None, None, 0.0, 1.0) if config.clamp_colors else ()))
+        else:
+            colors = Rate(decay, None, torch.tensor([rates.features] * 6 + [rates.features_time] * 3))
         inputs = torch.ones(SHAPES["hidden"][1])
-        inputs[6:9] = self._origin_scale()
+        inputs[6:9] = self._origin_scale
         temporal = decay if config.temporal_opacity else 0.0
         return {
-            "means": (rates.means * self._pace()) * units[:, None],
-            "motions": (rates.motions * decay) * units[:, None, None] * orders if config.motion else 0.0,
-            "quats": rates.quats * decay,
-            "omegas": rates.omegas * decay if config.rotation else 0.0,
-            "log_scales": rates.scales * decay,
-            "opacity_logits": rates.opacities * decay,
-            "features": features,
-            "trbf_centers": rates.trbf_centers * temporal,
-            "trbf_log_scales": rates.trbf_scales * temporal,
-            "hidden": rates.decoder * decay * inputs,
-            "output": rates.decoder * decay,
+            "means": Rate(rates.means * self._pace(), units),
+            "motions": Rate(rates.motions * decay if config.motion else 0.0, units, orders),
+            "quats": Rate(rates.quats * decay),
+            "omegas": Rate(rates.omegas * decay if config.rotation else 0.0),
+            "log_scales": Rate(rates.scales * decay),
+            "opacity_logits": Rate(rates.opacities * decay),
+            "features": colors,
+            "trbf_centers": Rate(rates.trbf_centers * temporal),
+            "trbf_log_scales": Rate(rates.trbf_scales * temporal),
+            "hidden": Rate(rates.decoder * decay, None, inputs),
+            "output": Rate(rates.decoder * decay),
         }
 
     def _control_number(self, loss: float, pixels: float) -> None:

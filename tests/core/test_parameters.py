@@ -15,7 +15,7 @@ from holoreel.core.gaussians.density import (
     reset_opacities,
 )
 from holoreel.core.gaussians.model import SpacetimeGaussians
-from holoreel.core.gaussians.parameters import BETAS, EPSILON, Parameters
+from holoreel.core.gaussians.parameters import BETAS, EPSILON, Parameters, Rate
 from holoreel.core.gaussians.scale import SceneScale
 from holoreel.core.render import reference
 from holoreel.core.render.reference import rotation_matrices
@@ -58,7 +58,7 @@ def test_adam_is_torchs_adam() -> None:
         for name, value in parameters.tensors.items():
             value.grad = torch.randn(value.shape, generator=rng)
             twins[name].grad = value.grad.double()
-        parameters.step(rates, reference)
+        parameters.step({name: Rate(rate) for name, rate in rates.items()}, reference)
         adam.step()
     for name, value in parameters.tensors.items():
         torch.testing.assert_close(value.detach().double(), twins[name].detach(), rtol=2e-5, atol=2e-5)
@@ -186,12 +186,20 @@ def test_rates_may_differ_by_row_and_zero_means_frozen() -> None:
     before = {name: value.detach().clone() for name, value in (parameters.tensors | parameters.network).items()}
     for value in (*parameters.tensors.values(), *parameters.network.values()):
         value.grad = torch.full_like(value, 1e-6)
-    rates = dict.fromkeys(before, 0.0) | {"means": torch.tensor([[1.0], [10.0], [0.0], [2.0]]), "hidden": 0.5}
+    rates = dict.fromkeys(before, Rate(0.0)) | {
+        "means": Rate(2.0, torch.tensor([0.5, 5.0, 0.0, 1.0])),
+        "motions": Rate(1.0, None, torch.tensor([1.0] * 3 + [0.0] * 6)),
+        "hidden": Rate(0.5),
+        "features": Rate(0.1, None, None, 0.5, 0.6),
+    }
     parameters.step(rates, reference)
     moved = {name: before[name] - value.detach() for name, value in (parameters.tensors | parameters.network).items()}
     torch.testing.assert_close(moved["means"], torch.tensor([[1.0], [10.0], [0.0], [2.0]]).expand(4, 3))
     torch.testing.assert_close(moved["hidden"], torch.full((6, 12), 0.5))
-    assert not any(value.any() for name, value in moved.items() if name not in ("means", "hidden"))
+    torch.testing.assert_close(moved["motions"], torch.tensor([1.0, 0.0, 0.0])[:, None].expand(4, 3, 3))
+    assert parameters.tensors["features"].min() >= 0.5
+    assert parameters.tensors["features"].max() <= 0.6
+    assert not any(value.any() for name, value in moved.items() if rates[name].rate == 0.0)
 
 
 def test_state_keeps_everything() -> None:
