@@ -74,18 +74,18 @@ def _calibrated(file: Path, label: str, entry: dict[str, Any]) -> Calibrated:
     matrix = _array(where, entry, "K", (3, 3))
     rotation = _array(where, entry, "R", (3, 3), (3,))
     pose = np.eye(4)
-    pose[:3, :3] = matrix_from_vector(rotation) if rotation.ndim == 1 else rotation
     pose[:3, 3] = _array(where, entry, "t", (3,))
     if abs(matrix[0, 1]) > 1e-3 * abs(matrix[0, 0]):
         raise HoloreelError(f"{where}: K has a skew of {matrix[0, 1]:g}; calibrate without skew.")
     model, distortion = _distortion(where, entry)
     video = entry.get("video")
     try:
+        pose[:3, :3] = matrix_from_vector(rotation) if rotation.ndim == 1 else rotation
         camera = Camera(
             size[0], size[1], matrix[0, 0], matrix[1, 1], matrix[0, 2] + 0.5, matrix[1, 2] + 0.5,
             pose, model=model, distortion=distortion,
         )  # fmt: skip
-    except HoloreelError as error:
+    except (HoloreelError, ValueError) as error:
         raise HoloreelError(f"{where}: {str(error).rstrip('.')}; calibrate it again.") from error
     return Calibrated(label, Path(video).stem if isinstance(video, str) else None, camera)
 

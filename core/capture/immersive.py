@@ -25,6 +25,7 @@ from .video_set import find_videos, pair, video_capture
 FILE_NAME = "models.json"
 HELD_OUT = "camera_0001"
 _MAX_CAMERAS = 10_000
+_MAX_NUMBER = 1e15
 
 
 def matches(path: Path) -> bool:
@@ -69,7 +70,7 @@ def _camera(file: Path, index: int, entry: Any) -> Camera:
     def numbers(key: str, least: int, default: list[float] | None = None) -> list[float]:
         value = entry.get(key, default)
         values = [finite(part) for part in (value if isinstance(value, list) else [value])]
-        if len(values) < least or any(part is None for part in values):
+        if len(values) < least or any(part is None or abs(part) > _MAX_NUMBER for part in values):
             raise HoloreelError(f"{where}.{key} must be {least} finite numbers, not {str(value)[:60]}: fetch it again.")
         return [float(part) for part in values if part is not None]
 
@@ -77,10 +78,11 @@ def _camera(file: Path, index: int, entry: Any) -> Camera:
     cx, cy = numbers("principal_point", 2)[:2]
     k1, k2 = numbers("radial_distortion", 2)[:2]
     (aspect,) = numbers("pixel_aspect_ratio", 1, [1.0])[:1]
+    orientation, position = numbers("orientation", 3)[:3], numbers("position", 3)[:3]
     matrix = np.eye(4)
-    matrix[:3, :3] = matrix_from_vector(numbers("orientation", 3)[:3])
-    matrix[:3, 3] = -matrix[:3, :3] @ numbers("position", 3)[:3]
     try:
+        matrix[:3, :3] = matrix_from_vector(orientation)
+        matrix[:3, 3] = -matrix[:3, :3] @ position
         return Camera(
             width,  # type: ignore[arg-type]  # checked to be whole by Camera
             height,  # type: ignore[arg-type]
@@ -93,7 +95,7 @@ def _camera(file: Path, index: int, entry: Any) -> Camera:
             name=entry["name"],
             distortion=(k1, k2, 0.0, 0.0),
         )
-    except HoloreelError as error:
+    except (HoloreelError, ValueError) as error:
         raise HoloreelError(f"{where}: {str(error).rstrip('.')}: fetch it again.") from error
 
 

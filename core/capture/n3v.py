@@ -62,8 +62,9 @@ def read_poses(file: Path) -> NDArray[np.float64]:
     """Read the table, (cameras, 17); its shape is checked before anything is allocated, nothing is unpickled."""
     try:
         table = np.load(file, mmap_mode="r", allow_pickle=False)
-    except (OSError, ValueError, EOFError, SyntaxError) as error:
-        raise HoloreelError(f"{file} cannot be read as an array of numbers ({error}): fetch it again.") from error
+    except Exception as error:  # the parser of its header raises what it likes
+        reason = (str(error).splitlines() or [type(error).__name__])[0]
+        raise HoloreelError(f"{file} cannot be read as an array of numbers ({reason}): fetch it again.") from error
     if table.ndim != 2 or table.shape[1] != 17 or not 1 <= table.shape[0] <= _MAX_CAMERAS or table.dtype.kind != "f":
         raise HoloreelError(f"{file} must hold rows of 17 numbers, not {table.dtype} {table.shape}: fetch it again.")
     return np.array(table, np.float64)

@@ -6,14 +6,15 @@ from numpy.typing import ArrayLike, NDArray
 
 Array = NDArray[np.float64]
 
+_MAX = 1e9  # of a number in a rotation: what is larger is damage
+
 
 def matrix_from_quaternion(quaternion: ArrayLike) -> Array:
     """Return the 3 × 3 rotation of w x y z, normalized first; a ValueError where it is zero or not finite."""
     q = np.asarray(quaternion, np.float64)
-    length = float(np.linalg.norm(q))
-    if not (q.shape == (4,) and np.isfinite(length) and length > 1e-9):
+    if q.shape != (4,) or not 1e-9 < np.abs(q).max() < _MAX:
         raise ValueError("is no rotation: a quaternion is 4 finite numbers, not all zero")
-    w, *axis = q / length
+    w, *axis = q / np.linalg.norm(q)
     return _expand(float(w), np.asarray(axis))
 
 
@@ -32,10 +33,9 @@ def quaternion_from_matrix(matrix: ArrayLike) -> Array:
 def matrix_from_vector(vector: ArrayLike) -> Array:
     """Return the 3 × 3 rotation about `vector` by its length; a ValueError where it is not finite."""
     v = np.asarray(vector, np.float64)
-    angle = float(np.linalg.norm(v))
-    if v.shape != (3,) or not np.isfinite(angle):
+    if v.shape != (3,) or not np.abs(v).max() < _MAX:
         raise ValueError("is no rotation: a rotation vector is 3 finite numbers")
-    half = angle / 2
+    half = float(np.linalg.norm(v)) / 2
     return _expand(float(np.cos(half)), v * float(np.sinc(half / np.pi) / 2))
 
 

@@ -225,7 +225,8 @@ def test_technicolor_pictures_of_another_size_or_none(scene: Callable[[str], Pat
         (lambda entries: entries[1].update(focal_length=0), "fx must be positive"),
         (lambda entries: entries[1].update(principal_point=[1]), "[1].principal_point must be 2"),
         (lambda entries: entries[1].update(position=[1, 2, 1e400]), "[1].position must be 3"),
-        (lambda entries: entries[1].update(position=[1, 2, 1e200]), "world_to_camera"),
+        (lambda entries: entries[1].update(position=[1, 2, 1e200]), "[1].position must be 3"),
+        (lambda entries: entries[1].update(orientation=[1, 2, 1e12]), "[1]: is no rotation"),
         (lambda entries: entries[1].update(width=1e9), "width"),
         (lambda entries: entries[1].update(projection_type="perspective"), "projection_type must be fisheye"),
         (lambda entries: entries.clear(), "must be a list of 1 to"),
@@ -254,6 +255,7 @@ def test_models_that_are_no_list_of_cameras(scene: Callable[[str], Path], text: 
         (lambda cameras: cameras[1].update(K="many"), "K must be 3x3 finite numbers"),
         (lambda cameras: cameras[1]["K"][0].__setitem__(1, 5.0), "skew of 5"),
         (lambda cameras: cameras[1].update(R=[[2, 0, 0], [0, 2, 0], [0, 0, 2]]), "must be a rotation"),
+        (lambda cameras: cameras[1].update(R=[1e12, 0, 0]), "is no rotation"),
         (lambda cameras: cameras[1].update(t=[0, 0, None]), "t must be 3 finite numbers"),
         (lambda cameras: cameras[1].update(dist=[0.1] * 6), "dist must be 0 or 4 or 5 or 8"),
         (lambda cameras: cameras[1].update(dist=[0.1] * 12), "thin prism and tilt"),
@@ -413,3 +415,43 @@ def test_bad_colmap_points(scene: Callable[[str], Path], data: bytes) -> None:
     (folder / MODEL / "points3D.bin").write_bytes(data)
     with pytest.raises(HoloreelError, match=r"points3D.bin"):
         read_capture(folder).seed_points(0)
+
+
+TABLES = {
+    "n3v": ["poses_bounds.npy"],
+    "technicolor": ["cameras_parameters.txt"],
+    "immersive": ["models.json"],
+    "videos": ["cameras_opencv.json", "timestamps.csv"],
+    "colmap": [f"{MODEL}cameras.bin", f"{MODEL}images.bin", f"{MODEL}points3D.bin"],
+}
+
+
+@pytest.mark.parametrize(("layout", "file"), [(layout, file) for layout, files in TABLES.items() for file in files])
+def test_no_damage_is_a_surprise(scene: Callable[[str], Path], layout: str, file: str) -> None:
+    """Whatever happens to a file, reading works or says why it does not."""
+    folder = scene(layout)
+    timestamps(folder, {"0": EVEN, "1": EVEN, "2": EVEN})
+    if file.endswith("points3D.bin"):
+        (folder / file).write_bytes(point(1.5, 2) + bytes(16))
+    whole = (folder / file).read_bytes()
+    random = np.random.default_rng(5)
+    refusals = []
+    for _ in range(120):
+        data = bytearray(whole)
+        for place in random.integers(0, max(len(data) - 60, 1), random.integers(1, 4)):
+            match random.integers(4):
+                case 0:
+                    data[place] ^= 1 << random.integers(8)
+                case 1:
+                    data[place : place + 8] = random.bytes(8)
+                case 2:
+                    data[place : place + 1] = [b"9", b"-", b"e99", b"null", b"[", b"nan", b"\n"][random.integers(7)]
+                case _:
+                    del data[place : place + random.integers(1, 20)]
+        (folder / file).write_bytes(data)
+        try:
+            read_capture(folder).seed_points(0)
+        except HoloreelError as error:
+            refusals.append(str(error))
+    assert refusals
+    assert not any("\n" in sentence for sentence in refusals)
