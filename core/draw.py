@@ -4,7 +4,7 @@
 from functools import lru_cache
 from pathlib import Path
 from types import ModuleType
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -16,11 +16,10 @@ from .errors import HoloreelError
 from .gaussians.decoder import Activation
 from .gaussians.model import SpacetimeGaussians
 from .reel import Loaded, Triple, load_gaussians
-from .render import get_backend
-from .render.contract import SpacetimeTensors
+from .render import Backend, get_backend
+from .render.contract import Rules, SpacetimeTensors
 from .render.view import DecoderTensors, decoder_tensors, render_view
 
-Backend = Literal["auto", "cpu", "reference"]
 SEGMENTS_HELD = 2  # in memory at a time: going back and forth over a seam reads nothing twice
 
 
@@ -42,13 +41,14 @@ def draw(
     backend: ModuleType,
     background: Triple = (0.0, 0.0, 0.0),
     decoder: DecoderTensors | None = None,
+    rules: Rules | None = None,
 ) -> Drawing:
     """Draw Gaussians at a normalized time through any lens; `backend` as `core.render.get_backend` returns it.
 
     With a `decoder`, `background` is ignored: it colors every pixel.
     """
     with torch.no_grad():
-        rendering = render_view(backend, gaussians, time, camera, torch.tensor(background), decoder)
+        rendering = render_view(backend, gaussians, time, camera, torch.tensor(background), decoder, rules)
     return Drawing(*(part.numpy() for part in rendering))
 
 
@@ -98,13 +98,15 @@ class Player:
             )
         return [float(frame) for frame in range(start, end + 1)]
 
-    def draw(self, camera: Camera, frame: float, background: Triple | None = None) -> Drawing:
+    def draw(
+        self, camera: Camera, frame: float, background: Triple | None = None, rules: Rules | None = None
+    ) -> Drawing:
         """Draw one frame, over the reel's own background unless another is given; a full model has none."""
         reel = self.first.reel
         segment, time = reel.locate(frame) if reel else (0, self.first.time_of(frame))
         gaussians, decoder = self._segment(segment)
         color = self.first.background if background is None else background
-        return draw(gaussians, time, camera, self.backend, color, decoder)
+        return draw(gaussians, time, camera, self.backend, color, decoder, rules)
 
     def _load(self, segment: int) -> tuple[SpacetimeTensors, DecoderTensors | None]:
         loaded = self.first if segment == 0 else load_gaussians(self.path, segment)

@@ -1,23 +1,42 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""`holoreel bench`: measure the kernels on this machine."""
+"""`holoreel bench`: measure the kernels, the training, the rendering and the method on this machine."""
 
-import json as json_format
-import os
+import re
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
 from ..errors import HoloreelError
+from ..files import write_json
 from ..machine import machine
-from ..render import get_backend
+from ..render import Backend, get_backend
 from ..render.native import TIMINGS, set_lanes
 
 if TYPE_CHECKING:  # the measuring itself needs torch, which --help need not wait for
-    from ..render.bench import Row
+    from ..bench.raster import Row
+
+
+def prepare(arguments: list[str]) -> Callable[..., None]:
+    """Return the measurement that the arguments name."""
+    name = next((argument for argument in arguments if not argument.startswith("-")), "")
+    return MEASUREMENTS.get(name, run)
 
 
 def run(
+    what: Annotated[Literal["raster", "train", "render", "ablation", "seams"], tyro.conf.Positional],
+) -> None:
+    """Measure something on this machine; `holoreel bench WHAT --help` explains each.
+
+    Args:
+        what: `raster`, the kernels; `train`, whole training iterations; `render`, frames per second of a reel;
+            `ablation`, what each part of the method brings; `seams`, the hand-over between a reel's segments.
+    """
+    raise HoloreelError(f"there is nothing to measure called {what!r} here.")
+
+
+def raster(
     what: Annotated[Literal["raster"], tyro.conf.Positional],
     reference: bool = True,
     rounds: int = 7,
@@ -26,23 +45,17 @@ def run(
     """Print how many milliseconds rendering takes, forward and backward, and how that compares with plain torch.
 
     Args:
-        what: What to measure: `raster`, the whole chain from raw parameters to pictures and back.
+        what: The whole chain from raw parameters to pictures and back.
         reference: Measure plain torch too, at 640 x 360 with 200,000 Gaussians and 3 channels (slow, takes about 4 GB).
         rounds: How often each row is measured; the table shows medians.
         json: Write the figures to this file too.
     """
-    if rounds < 1:
-        raise HoloreelError("--rounds must be 1 or more.")
-    if json is not None and not json.absolute().parent.is_dir():
-        raise HoloreelError(f"{json}: the folder does not exist; make it or choose another for --json.")
+    _check(rounds, json)
     get_backend("cpu")
-    from ..render import bench
+    from ..bench import raster as bench
 
-    hardware = {**machine(), "lanes": set_lanes(0)}
-    print(
-        f"{hardware['processor']}, {hardware['cores']} cores, {hardware['lanes']} lanes; whole chain, milliseconds, "
-        f"medians of {rounds}"
-    )
+    hardware = _hardware()
+    print(f"{_describe(hardware)}; whole chain, milliseconds, medians of {rounds}")
     print(HEADER)
     rows = []
     alone: dict[tuple[int, ...], float] = {}
@@ -55,7 +68,125 @@ def run(
     if reference:
         rows += _against_reference(rounds)
     if json is not None:
-        _write(json, {"machine": hardware, "rows": [row.as_dict() for row in rows]})
+        write_json(json, {"machine": hardware, "rows": [row.as_dict() for row in rows]})
+
+
+def train(
+    what: Annotated[Literal["train"], tyro.conf.Positional],
+    preset: str = "lite",
+    size: str | None = None,
+    gaussians: int = 100_000,
+    backend: Backend = "auto",
+    rounds: int = 30,
+    json: Path | None = None,
+) -> None:
+    """Print how long a whole training iteration takes, where the time goes, and what the raster kernels take of it.
+
+    Args:
+        what: The trainer's own steps on a random scene.
+        preset: The settings to train with.
+        size: Pictures as WIDTHxHEIGHT; without it, 640x360 with 100,000 Gaussians and 269x479 with 11,000.
+        gaussians: How many, where a size is given.
+        backend: What to render with.
+        rounds: How many iterations are measured; the table shows medians.
+        json: Write the figures to this file too.
+    """
+    _check(rounds, json)
+    from ..bench import train as bench
+    from ..gaussians.config import PRESETS
+
+    if preset not in PRESETS:
+        raise HoloreelError(f"--preset {preset}: no such preset; take one of {', '.join(PRESETS)}.")
+    setups = (bench.Setup(*parse_size(size), gaussians),) if size else bench.SETUPS
+    hardware = _hardware()
+    print(f"{_describe(hardware)}; milliseconds per iteration, medians of {rounds}")
+    rows = []
+    for setup in setups:
+        rows.append(bench.measure(setup, preset, rounds, backend))
+        print(bench.report(rows[-1:]), flush=True)
+    if json is not None:
+        write_json(json, {"machine": hardware, "rows": [row.as_dict() for row in rows]})
+
+
+def render(
+    what: Annotated[Literal["render"], tyro.conf.Positional],
+    reel: Annotated[Path, tyro.conf.Positional],
+    view: Path,
+    size: str | None = None,
+    backend: Backend = "auto",
+    json: Path | None = None,
+) -> None:
+    """Print how many frames of a reel are drawn in a second, with and without temporal culling.
+
+    Args:
+        what: All frames of a reel, PLY or .splatv, from one camera.
+        reel: The file.
+        view: A CAMERA.json, or a capture: its first camera that is held out.
+        size: Pictures as WIDTHxHEIGHT instead of the camera's own.
+        backend: What to render with.
+        json: Write the figures to this file too.
+    """
+    _check(1, json)
+    from ..bench import render as bench
+
+    result = bench.measure(reel, view, parse_size(size) if size else None, backend)
+    hardware = _hardware()
+    print(f"{_describe(hardware)}\n{bench.report(result)}")
+    if json is not None:
+        write_json(json, {"machine": hardware, **result.as_dict()})
+
+
+def seams(
+    what: Annotated[Literal["seams"], tyro.conf.Positional],
+    reel: Annotated[Path, tyro.conf.Positional],
+    capture: Path,
+    camera: str | None = None,
+    backend: Backend = "auto",
+    out: Path | None = None,
+) -> None:
+    """Print how a reel's segments hand over to each other in a view that was not trained on.
+
+    Args:
+        what: The frames around each boundary, and still pixels across it.
+        reel: A reel of several segments.
+        capture: The capture it was trained on.
+        camera: A camera held out; without it, the first of the test split.
+        backend: What to render with.
+        out: A folder for seams.json and the height-time slice as a picture.
+    """
+    from ..bench.seams import measure_seams, report_seams, write_seams
+    from ..capture import read_capture
+
+    result = measure_seams(reel, read_capture(capture), camera, backend)
+    print(report_seams(result))
+    if out is not None:
+        print(write_seams(result, out))
+
+
+MEASUREMENTS: dict[str, Callable[..., None]] = {"raster": raster, "train": train, "render": render, "seams": seams}
+
+
+def parse_size(text: str) -> tuple[int, int]:
+    """Return the width and height of a text like 640x360."""
+    found = re.fullmatch(r"([1-9]\d{0,4})x([1-9]\d{0,4})", text)
+    if not found:
+        raise HoloreelError(f"--size {text}: write it as WIDTHxHEIGHT, like 1352x1014.")
+    return int(found[1]), int(found[2])
+
+
+def _check(rounds: int, json: Path | None) -> None:
+    if rounds < 1:
+        raise HoloreelError("--rounds must be 1 or more.")
+    if json is not None and not json.absolute().parent.is_dir():
+        raise HoloreelError(f"{json}: the folder does not exist; make it or choose another for --json.")
+
+
+def _hardware() -> dict[str, object]:
+    return {**machine(), "lanes": set_lanes(0)}
+
+
+def _describe(hardware: dict[str, object]) -> str:
+    return f"{hardware['processor']}, {hardware['cores']} cores, {hardware['lanes']} lanes"
 
 
 HEADER = (
@@ -77,7 +208,7 @@ def _line(row: "Row", speedup: str) -> str:
 
 def _against_reference(rounds: int) -> list["Row"]:
     """Measure the kernels before and after plain torch, so that a busy machine is busy for both."""
-    from ..render import bench
+    from ..bench import raster as bench
 
     threads = min(2, bench.native.available_cores())
     setup = bench.Setup(640, 360, 200_000, 3, threads)
@@ -91,9 +222,3 @@ def _against_reference(rounds: int) -> list["Row"]:
         f" the kernels {ours:.1f} ms (measured before and after), {torch_row.total / ours:.0f} times faster"
     )
     return [torch_row, before, after]
-
-
-def _write(path: Path, figures: dict[str, object]) -> None:
-    temporary = path.with_name(path.name + ".part")
-    temporary.write_text(json_format.dumps(figures, indent=1))
-    os.replace(temporary, path)

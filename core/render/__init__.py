@@ -6,10 +6,12 @@ import warnings
 from types import ModuleType
 from typing import Literal
 
+Backend = Literal["auto", "cpu", "reference"]
+
 _warned = False
 
 
-def get_backend(name: Literal["auto", "cpu", "reference"] = "auto") -> ModuleType:
+def get_backend(name: Backend = "auto") -> ModuleType:
     """Return the backend module `name`, with `rasterize` and `rasterize_spacetime` as `contract` describes them.
 
     `auto` takes the compiled kernels, or, where they cannot be loaded, the plain torch `reference`, and warns about it

@@ -56,7 +56,8 @@ class Rules:
     covariance. Gaussians nearer than `near` are skipped. Where the Jacobian is taken, and there alone, `x/z` and `y/z`
     are held within the picture and a margin on each of its four sides, wherever the principal point lies: the margin is
     (jacobian_clamp - 1) / 2 of the width or height. `detach_motion_time` makes `trbf_centers` learn from the opacity
-    alone, as the authors train: by default it also gets the gradient through motion and rotation.
+    alone, as the authors train: by default it also gets the gradient through motion and rotation. Without `cull_faded`
+    the kernels project and tile what the time has faded out too, as the authors do: the same picture, later.
     """
 
     alpha_max: float = 0.99
@@ -66,6 +67,7 @@ class Rules:
     near: float = 0.2
     jacobian_clamp: float = 1.3
     detach_motion_time: bool = False
+    cull_faded: bool = True
 
 
 class SpacetimeTensors(NamedTuple):

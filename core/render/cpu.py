@@ -95,7 +95,8 @@ class _Job:
     def c_rules(self) -> CRules:
         r = self.rules
         return CRules(
-            r.alpha_max, r.alpha_min, r.transmittance_min, r.low_pass, r.near, r.jacobian_clamp, r.detach_motion_time, 0
+            *(r.alpha_max, r.alpha_min, r.transmittance_min, r.low_pass, r.near, r.jacobian_clamp),
+            *(r.detach_motion_time, r.cull_faded),
         )
 
     def c_gaussians(self, arrays: tuple[Tensor | None, ...]) -> CGaussians:

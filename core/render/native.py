@@ -10,7 +10,7 @@ from pathlib import Path
 
 from ..errors import HoloreelError
 
-ABI = 6  # HOLOREEL_ABI in kernels/api.hpp
+ABI = 7  # HOLOREEL_ABI in kernels/api.hpp
 
 
 class CCamera(Structure):
@@ -33,7 +33,7 @@ class CRules(Structure):
             for name in ("alpha_max", "alpha_min", "transmittance_min", "low_pass", "near", "jacobian_clamp")
         ),
         ("detach_motion_time", c_int32),
-        ("unused", c_int32),
+        ("cull_faded", c_int32),
     )
 
 

@@ -376,6 +376,22 @@ def test_detach_motion_time_agrees_with_the_reference():
     assert relative(attached[7], oracle[7]) > 1e-3
 
 
+def test_without_temporal_culling_the_picture_is_the_same():
+    case = hard_case(3)
+    case.gaussians.trbf_log_scales[::3] = -2.0
+    case.gaussians.opacity_logits[:40:4] = -200.0
+    scene = case.gaussians, TIME, case.camera, case.background
+    results, visible = [], []
+    for rules in (Rules(), Rules(cull_faded=False)):
+        arrays = SpacetimeTensors(*(array.clone().requires_grad_() for array in scene[0]))
+        pictures = cpu.rasterize_spacetime(arrays, *scene[1:], rules)
+        visible.append(pictures.features.grad_fn.frame.intersections)
+        pictures.features.square().sum().backward()
+        results.append((*pictures, *(array.grad for array in arrays)))
+    assert all(torch.equal(a, b) for a, b in zip(*results, strict=True))
+    assert visible[1] > 1.2 * visible[0]
+
+
 def test_no_gradient_no_graph():
     case = plain_case(3, 100, 32, 32)
     with torch.no_grad():

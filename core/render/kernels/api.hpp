@@ -4,7 +4,7 @@
 
 #include <cstdint>
 
-#define HOLOREEL_ABI 6
+#define HOLOREEL_ABI 7
 #define HOLOREEL_API extern "C" __attribute__((visibility("default")))
 
 struct HoloreelCamera {
@@ -16,7 +16,7 @@ struct HoloreelCamera {
 struct HoloreelRules {
     double alpha_max, alpha_min, transmittance_min, low_pass, near_plane, jacobian_clamp;
     int32_t detach_motion_time;
-    int32_t unused;
+    int32_t cull_faded;
 };
 
 // N rows in each array. With `spacetime` the parameters are raw (Eqs. 6-9); without it `scales` are linear, `opacities` lie

@@ -136,9 +136,20 @@ HOLOREEL_HEAVY_CLONES void project_chunk(const HoloreelGaussians& g, const View&
     overflow.clear();
     const int64_t begin = chunk * kChunk, end = std::min(begin + kChunk, frame.count);
     visible = slots = 0;
+    uint32_t alive[kChunk];
+    int64_t count = 0;
     for (int64_t first = begin; first < end; first += kRows) {
-        const RowRange rows{first, static_cast<int>(std::min<int64_t>(kRows, end - first))};
-        for (int lane = 0; lane < rows.count; lane++) frame.footprints[first + lane].tiles = 0;
+        const RowSet rows(first, end);
+        Instant instant;
+        const Mask seen = fade(g, rows, rules, instant);
+        for (int lane = 0; lane < rows.count; lane++) {
+            frame.footprints[first + lane].tiles = 0;
+            alive[count] = static_cast<uint32_t>(first + lane);
+            count += seen[lane] & 1;
+        }
+    }
+    for (int64_t k = 0; k < count; k += kRows) {
+        const RowSet rows(alive + k, count - k);
         Instant instant;
         Splats splats;
         Mask seen = evaluate(g, rows, rules, instant);
@@ -146,11 +157,13 @@ HOLOREEL_HEAVY_CLONES void project_chunk(const HoloreelGaussians& g, const View&
         seen &= project(instant, view, rules, splats);
         for (int lane = 0; lane < rows.count; lane++) {
             if (!seen[lane]) continue;
-            const int64_t i = first + lane;
+            const int64_t i = rows.rows[lane];
             Footprint& footprint = frame.footprints[i];
             const Splat splat = splat_at(splats, lane);
             const double log_opacity = std::log(instant.opacity[lane]);
-            const Ellipse ellipse(splat, 2.0 * (log_opacity - log_alpha_min));
+            // What no pixel can show is here only where it was asked for, and then within three sigma.
+            const double reach = log_opacity < log_alpha_min ? 9.0 : 2.0 * (log_opacity - log_alpha_min);
+            const Ellipse ellipse(splat, reach);
             lay_out(splat, ellipse, frame, footprint, overflow);
             if (footprint.tiles == 0) continue;
             write_record(g, i, log_opacity, splat, ellipse, frame, frame.records.data() + i * stride);

@@ -45,14 +45,14 @@ SplatGradient splat_gradient(const Splats& s, const D* sums) {
     return d;
 }
 
-void update_density(const HoloreelGradients& out, const RowRange& rows, Mask wanted, const Splats& s,
+void update_density(const HoloreelGradients& out, const RowSet& rows, Mask wanted, const Splats& s,
                     const SplatGradient& d) {
     const D pull = sqrt(d.x * d.x + d.y * d.y);
     const D middle = 0.5 * (s.cov_xx + s.cov_yy), half = 0.5 * (s.cov_xx - s.cov_yy);
     const D radius = 3.0 * sqrt(middle + sqrt(half * half + s.cov_xy * s.cov_xy));
     for (int lane = 0; lane < rows.count; lane++) {
         if (!wanted[lane]) continue;
-        const int64_t i = rows.first + lane;
+        const int64_t i = rows.rows[lane];
         if (out.density_gradient) out.density_gradient[i] += static_cast<float>(pull[lane]);
         if (out.density_views) out.density_views[i]++;
         if (out.density_radius_px)
@@ -74,18 +74,24 @@ HOLOREEL_HEAVY_CLONES void gather_chunk(const HoloreelGaussians& g, const View& 
     const int padded = frame.padded_channels, width = kMoments + padded + (with_depth ? 1 : 0);
     const bool density = out.density_gradient || out.density_views || out.density_radius_px;
     const int64_t end = std::min((chunk + 1) * kChunk, frame.count);
-    for (int64_t first = chunk * kChunk; first < end; first += kRows) {
-        const RowRange rows{first, static_cast<int>(std::min<int64_t>(kRows, end - first))};
-        Mask seen{};
-        for (int lane = 0; lane < rows.count; lane++) seen[lane] = frame.footprints[first + lane].tiles ? -1 : 0;
+    uint32_t visible[kChunk];
+    int64_t count = 0;
+    for (int64_t i = chunk * kChunk; i < end; i++) {
+        if (frame.footprints[i].tiles)
+            visible[count++] = static_cast<uint32_t>(i);
+        else
+            clear_row(out, i, frame.channels);
+    }
+    for (int64_t k = 0; k < count; k += kRows) {
+        const RowSet rows(visible + k, count - k);
         Instant instant{};
         Splats splats{};
         // These hold for what the forward pass saw, unless the arrays were changed in between.
-        if (any(seen)) seen &= evaluate(g, rows, rules, instant);
+        Mask seen = evaluate(g, rows, rules, instant);
         if (any(seen)) seen &= project(instant, view, rules, splats);
         D moments[kMoments], d_depth = all(0.0);
         for (int lane = 0; lane < rows.count; lane++) {
-            const int64_t i = first + lane;
+            const int64_t i = rows.rows[lane];
             if (!seen[lane]) {
                 clear_row(out, i, frame.channels);
                 continue;

@@ -37,15 +37,22 @@ inline D exp(D x) {
     return (D)((Mask)sum + ((Mask)shifted << 52));
 }
 
-// Consecutive rows of an array: `first` on, lanes beyond the `count` rows repeat the last one.
-struct RowRange {
-    int64_t first;
+// Up to four rows of the arrays; lanes beyond `count` repeat the last one.
+struct RowSet {
+    int64_t rows[kRows];
     int count;
 
-    int64_t row(int lane) const { return first + (lane < count ? lane : count - 1); }
+    // The next of a list of row numbers that has `left` more.
+    RowSet(const uint32_t* list, int64_t left) : count(left < kRows ? static_cast<int>(left) : kRows) {
+        for (int lane = 0; lane < kRows; lane++) rows[lane] = list[lane < count ? lane : count - 1];
+    }
+    RowSet(int64_t first, int64_t end) : count(end - first < kRows ? static_cast<int>(end - first) : kRows) {
+        for (int lane = 0; lane < kRows; lane++) rows[lane] = first + (lane < count ? lane : count - 1);
+    }
+
     template <int K>
     void load(const float* array, D* out) const {
-        const float *a = array + K * row(0), *b = array + K * row(1), *c = array + K * row(2), *d = array + K * row(3);
+        const float *a = array + K * rows[0], *b = array + K * rows[1], *c = array + K * rows[2], *d = array + K * rows[3];
         for (int k = 0; k < K; k++) out[k] = D{a[k], b[k], c[k], d[k]};
     }
     // Writes the lanes in `wanted`, if there is an array.
@@ -54,7 +61,7 @@ struct RowRange {
         if (!array) return;
         for (int lane = 0; lane < count; lane++)
             if (wanted[lane])
-                for (int k = 0; k < K; k++) array[K * (first + lane) + k] = static_cast<float>(values[k][lane]);
+                for (int k = 0; k < K; k++) array[K * rows[lane] + k] = static_cast<float>(values[k][lane]);
     }
 };
 

@@ -29,10 +29,10 @@ inline D poison(const D* values) {
     return sum;
 }
 
-inline D feature_poison(const HoloreelGaussians& g, const RowRange& rows) {
+inline D feature_poison(const HoloreelGaussians& g, const RowSet& rows) {
     D sum = all(0.0);
     for (int lane = 0; lane < kRows; lane++) {
-        const float* features = g.features + rows.row(lane) * g.channels;
+        const float* features = g.features + rows.rows[lane] * g.channels;
         float total = 0.0f;
         for (int c = 0; c < g.channels; c++) total += features[c] * 0.0f;
         sum[lane] = total;
@@ -40,31 +40,36 @@ inline D feature_poison(const HoloreelGaussians& g, const RowRange& rows) {
     return sum;
 }
 
-// Reads rows; returns the lanes that count. Rows are skipped where the opacity is under `alpha_min` or a parameter is not
-// finite; but an infinite `trbf_log_scale` is allowed: such a Gaussian is always on. Where no lane counts, `out` is not whole.
-inline Mask evaluate(const HoloreelGaussians& g, const RowRange& rows, const HoloreelRules& rules, Instant& out) {
-    D logit, center, log_width;
-    rows.load<1>(g.opacities, &logit);
+// Fills the opacity and what it is made of (Eq. 7); returns the lanes that can be seen. The others are under `alpha_min`, or
+// without `cull_faded` zero; a NaN is never seen.
+inline Mask fade(const HoloreelGaussians& g, const RowSet& rows, const HoloreelRules& rules, Instant& out) {
+    rows.load<1>(g.opacities, &out.opacity);
     if (g.spacetime) {
+        D center, log_width;
         rows.load<1>(g.trbf_centers, &center);
         rows.load<1>(g.trbf_log_scales, &log_width);
         out.dt = g.time - center;
         out.inverse_width = exp(-(log_width < all(kMinLogWidth) ? all(kMinLogWidth) : log_width));
         out.u = out.dt * out.inverse_width;
         out.temporal = exp(-out.u * out.u);
-        out.occupancy = 1.0 / (1.0 + exp(-logit));
+        out.occupancy = 1.0 / (1.0 + exp(-out.opacity));
         out.opacity = out.occupancy * out.temporal;
-    } else {
-        out.opacity = logit;
     }
-    // Written so that a NaN is skipped too. What the time has faded out costs nothing beyond this line.
-    Mask alive = out.opacity >= all(rules.alpha_min);
+    return rules.cull_faded ? out.opacity >= all(rules.alpha_min) : out.opacity > all(0.0);
+}
+
+// Reads rows; returns the lanes that can be seen and have no parameter that is not finite; but an infinite
+// `trbf_log_scale` is allowed: such a Gaussian is always on. Where no lane can be seen, `out` is not whole.
+inline Mask evaluate(const HoloreelGaussians& g, const RowSet& rows, const HoloreelRules& rules, Instant& out) {
+    const Mask alive = fade(g, rows, rules, out);
     if (!any(alive)) return alive;
 
+    D opacity;
+    rows.load<1>(g.opacities, &opacity);
     rows.load<3>(g.means, out.mean);
     rows.load<4>(g.quats, out.quat);
     rows.load<3>(g.scales, out.scale);
-    D bad = poison<3>(out.mean) + poison<4>(out.quat) + poison<3>(out.scale) + logit * 0.0 + feature_poison(g, rows);
+    D bad = poison<3>(out.mean) + poison<4>(out.quat) + poison<3>(out.scale) + poison<1>(&opacity) + feature_poison(g, rows);
     if (g.spacetime) {
         D b[9], omega[4];
         rows.load<9>(g.motions, b);
@@ -79,7 +84,7 @@ inline Mask evaluate(const HoloreelGaussians& g, const RowRange& rows, const Hol
 }
 
 // Writes every parameter gradient except `features`, on the lanes in `wanted`.
-inline void evaluate_backward(const HoloreelGaussians& g, const RowRange& rows, const HoloreelRules& rules,
+inline void evaluate_backward(const HoloreelGaussians& g, const RowSet& rows, const HoloreelRules& rules,
                               const Instant& instant, const InstantGradient& d, Mask wanted,
                               const HoloreelGradients& out) {
     rows.store<3>(out.means, d.mean, wanted);

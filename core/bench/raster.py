@@ -11,9 +11,9 @@ from types import ModuleType
 import torch
 
 from ..camera import Camera
-from . import cpu, native, reference
-from .contract import Rendering, SpacetimeTensors
-from .scenes import random_scene
+from ..render import cpu, native, reference
+from ..render.contract import Rendering, SpacetimeTensors
+from ..render.scenes import random_scene
 
 SIZES = ((640, 360), (1352, 1014))
 COUNTS = (50_000, 200_000)
