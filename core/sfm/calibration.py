@@ -27,6 +27,7 @@ TIMES_TYPICAL = 4.0  # a contradiction is this much larger than what the best pa
 TIMES_FLOOR = 2.5  # though never more than this much larger than the least that counts: all may be wrong
 
 _MIN_MATCHES = 15  # for a pair or a triple to have a say
+_MIN_EVIDENCE = 100  # bad matches, with two other cameras, that it takes to accuse one: chance finds a few that agree
 _MAX_SAMPLE = 300  # matches of one pair or triple of one frame
 _MAX_TRIPLES = 1500
 _MIN_RAY_ANGLE = np.radians(1.0)
@@ -101,6 +102,13 @@ class CalibrationCheck:
                 )
             )
         return checks
+
+    def _evident(self, index: int, tests: dict[Members, Array], limit: float) -> bool:
+        """Whether enough matches speak against a camera: one pair of pictures may have been matched wrongly."""
+        bad = {members: values for members, values in tests.items() if index in members and np.median(values) > limit}
+        partners = {other for members in bad for other in members} - {index}
+        enough = sum(map(len, bad.values())) >= _MIN_EVIDENCE
+        return enough and len(partners) >= min(2, len(self._cameras) - 1)
 
     def _put(self, members: Members, residuals: Array) -> None:
         residuals = residuals[np.isfinite(residuals)]

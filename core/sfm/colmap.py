@@ -54,11 +54,16 @@ def triangulate(job: dict[str, Any], emit: Emit) -> dict[str, Any]:
         image = pycolmap.Image(name=str(index), camera_id=camera["lens"] + 1, image_id=index + 1)
         rotation = pycolmap.Rotation3d(pose[:3, :3])
         known.add_image_with_trivial_frame(image, pycolmap.Rigid3d(rotation, pose[:3, 3]))
+    matches = _verified(job, database)
+    if matches:  # those above are judged without the poses, to judge the poses by; points take what fits the poses
+        pycolmap.guided_geometric_verification(
+            known, database, two_view_geometry_options=_verification(), num_threads=job["options"]["threads"]
+        )
     options = _mapper_options(job)
     result = pycolmap.triangulate_points(
         known, database, job["pictures"], _folder(job, "out"), options=options, refine_intrinsics=False
     )
-    return _finish(job, database, _points(result))
+    return _finish(job, database, matches, _points(result))
 
 
 def reconstruct(job: dict[str, Any], emit: Emit) -> dict[str, Any]:
@@ -79,7 +84,8 @@ def reconstruct(job: dict[str, Any], emit: Emit) -> dict[str, Any]:
                 best = model
         if best is not None and best.num_reg_images() == len(job["cameras"]):
             break
-    return _finish(job, database, {} if best is None else _points(best) | _poses(best, job))
+    found = {} if best is None else _points(best) | _poses(best, job)
+    return _finish(job, database, _verified(job, database), found)
 
 
 def _rank(model: pycolmap.Reconstruction) -> tuple[int, int]:
@@ -167,6 +173,7 @@ def _match(job: dict[str, Any], path: Path) -> None:
     options.use_gpu = False
     options.num_threads = job["options"]["threads"]
     options.guided_matching = job["options"]["guided"]
+    options.skip_geometric_verification = not options.guided_matching  # that comes when frames are merged
     pairing = pycolmap.ImportedPairingOptions()
     pairing.match_list_path = _pairs_file(job, pairs)
     pycolmap.match_image_pairs(path, options, pairing, _verification(), pycolmap.Device.cpu)
@@ -202,13 +209,23 @@ def _merge(job: dict[str, Any], by_picture: Path, by_camera: Path) -> list[tuple
             parts = [np.empty((0, 2), np.uint32)]
             for frame, names in enumerate(job["frames"]):
                 if names[a] in ids and names[b] in ids:
-                    found = source.read_two_view_geometry(ids[names[a]], ids[names[b]]).inlier_matches
+                    found = _matches(source, ids[names[a]], ids[names[b]], job["options"]["guided"])
                     parts.append(found + np.array([offsets[a][frame], offsets[b][frame]], np.uint32))
             matches = np.concatenate(parts)
             if len(matches) >= MIN_MATCHES:
                 target.write_matches(a + 1, b + 1, matches)
                 pairs.append((str(a), str(b)))
     return pairs
+
+
+def _matches(database: pycolmap.Database, a: int, b: int, guided: bool) -> NDArray[np.uint32]:
+    """All matches of two pictures, with those that guided matching has found beside them."""
+    if not database.exists_matches(a, b):
+        return np.empty((0, 2), np.uint32)
+    matches = database.read_matches(a, b)
+    if guided:
+        matches = np.unique(np.concatenate([matches, database.read_two_view_geometry(a, b).inlier_matches]), axis=0)
+    return matches
 
 
 def _write_image(
@@ -255,20 +272,27 @@ def _poses(model: pycolmap.Reconstruction, job: dict[str, Any]) -> Arrays:
     return {"poses": poses, "registered": registered, "params": params}
 
 
-def _finish(job: dict[str, Any], path: Path, found: Arrays) -> dict[str, Any]:
-    """Write the result, with all keypoints and verified matches; return how many points it holds."""
-    arrays = dict(found)
+def _verified(job: dict[str, Any], path: Path) -> dict[tuple[int, int], NDArray[np.int64]]:
+    """The matches of each pair of cameras that fit one geometry."""
+    found = {}
+    with pycolmap.Database.open(path) as database:
+        for a, b in job["pairs"]:
+            if database.exists_matches(a + 1, b + 1):
+                matches = np.asarray(database.read_two_view_geometry(a + 1, b + 1).inlier_matches, np.int64)
+                if len(matches):
+                    found[a, b] = matches
+    return found
+
+
+def _finish(
+    job: dict[str, Any], path: Path, matches: dict[tuple[int, int], NDArray[np.int64]], found: Arrays
+) -> dict[str, Any]:
+    """Write the result, with all keypoints and the matches; return how many points it holds."""
+    arrays = found | {f"matches_{index}": value for index, value in enumerate(matches.values())}
+    arrays["pairs"] = np.array(list(matches), np.int64).reshape(-1, 2)
     with pycolmap.Database.open(path) as database:
         for index in range(len(job["cameras"])):
             arrays[f"keypoints_{index}"] = database.read_keypoints(index + 1)[:, :2]
-        pairs = []
-        for a, b in job["pairs"]:
-            if database.exists_matches(a + 1, b + 1):
-                matches = database.read_two_view_geometry(a + 1, b + 1).inlier_matches
-                if len(matches):
-                    arrays[f"matches_{len(pairs)}"] = np.asarray(matches, np.int64)
-                    pairs.append((a, b))
-    arrays["pairs"] = np.array(pairs, np.int64).reshape(-1, 2)
     with atomic_path(job["out"]) as temporary:
         np.savez(temporary, **arrays)
     return {"points": len(arrays.get("xyz", ())), "pycolmap": pycolmap.__version__}

@@ -24,7 +24,7 @@ class Features:
 
 QUALITIES: dict[str, Features] = {
     "low": Features(1000, 4096, affine=False, guided=False),
-    "medium": Features(2000, 8192, affine=False, guided=True),
+    "medium": Features(2000, 8192, affine=False, guided=False),
     "high": Features(3200, 16384, affine=True, guided=True),
 }
 MANY_CAMERAS = 8  # from here on a point must be seen by three of them
