@@ -18,9 +18,10 @@ from holoreel.core.gaussians.config import PRESETS, DensityConfig, GuidedConfig,
 from holoreel.core.gaussians.model import SpacetimeGaussians
 from holoreel.core.gaussians.parameters import Parameters
 from holoreel.core.gaussians.run import RunPaths, train_reel
-from holoreel.core.gaussians.train import Trainer
+from holoreel.core.gaussians.train import Trainer, valid_pixels
 from holoreel.core.reel import load_gaussians
 from holoreel.core.render import get_backend
+from holoreel.core.render.view import render_view
 
 FRAMES, WIDTH, HEIGHT = 4, 64, 48
 QUICK = TrainConfig(iterations=40, checkpoint_every=10, density=DensityConfig(prune_every=7, events=2))
@@ -53,31 +54,43 @@ def true_scene() -> SpacetimeGaussians:
     )
 
 
-@pytest.fixture(scope="module")
-def capture(tmp_path_factory: pytest.TempPathFactory) -> Capture:
-    """The true scene seen by five cameras, the middle one held out."""
-    folder = tmp_path_factory.mktemp("capture")
+def recorded(folder: Path, cameras: dict[str, Camera], blind: int | None = None) -> Capture:
+    """The true scene as `cameras` see it, cam00 held out; pixels that a lens cannot see have the value `blind`."""
     backend, scene = get_backend(), true_scene()
-    cameras = {
-        f"cam{index:02d}": Camera.look_at(
-            (3 * np.sin(angle), -3 * np.cos(angle), 0.3 * (index % 2)), (0, 0, 0), width=WIDTH, height=HEIGHT, fx=60.0
-        )
-        for index, angle in enumerate(np.radians([0, -24, -12, 12, 24]))
-    }
     images, seeds = {}, {}
     tensors = Parameters(scene).spacetime
     for frame in range(FRAMES):
         for name, camera in cameras.items():
             with torch.no_grad():
-                picture = backend.rasterize_spacetime(tensors, frame / FRAMES, camera).features.clamp(0, 1)
+                picture = render_view(backend, tensors, frame / FRAMES, camera).features.clamp(0, 1)
+            pixels = np.rint(picture.numpy() * 255).astype(np.uint8)
+            valid = valid_pixels(camera)
+            if valid is not None and blind is not None:
+                pixels[~valid.numpy()] = blind
             images[name, frame] = folder / f"{name}-{frame}.png"
-            imageio.imwrite(images[name, frame], np.rint(picture.numpy() * 255).astype(np.uint8))
+            imageio.imwrite(images[name, frame], pixels)
         now = scene.evaluate(frame / FRAMES)
         rgb = np.rint(now.features * 255).astype(np.uint8)
         seeds[frame] = folder / f"seeds-{frame}.ply"
         write_points(seeds[frame], Points(now.means, rgb))
-    capture = Capture(cameras, images, FRAMES, splits={"cam00": "test"}, fps=24.0, frame_start=3, seeds=seeds)
-    return read_capture(write_capture(folder, capture))
+    return Capture(cameras, images, FRAMES, splits={"cam00": "test"}, fps=24.0, frame_start=3, seeds=seeds)
+
+
+def around(fx: float = 60.0) -> dict[str, Camera]:
+    """Five cameras on an arc, the middle one first."""
+    return {
+        f"cam{index:02d}": Camera.look_at(
+            (3 * np.sin(angle), -3 * np.cos(angle), 0.3 * (index % 2)), (0, 0, 0), width=WIDTH, height=HEIGHT, fx=fx
+        )
+        for index, angle in enumerate(np.radians([0, -24, -12, 12, 24]))
+    }
+
+
+@pytest.fixture(scope="module")
+def capture(tmp_path_factory: pytest.TempPathFactory) -> Capture:
+    """The true scene seen by five cameras, the middle one held out."""
+    folder = tmp_path_factory.mktemp("capture")
+    return read_capture(write_capture(folder, recorded(folder, around())))
 
 
 def heldout_psnr(trainer: Trainer, capture: Capture) -> float:
@@ -405,3 +418,26 @@ def test_every_preset_trains_and_its_moments_come(capture: Capture, name: str) -
     before = heldout_psnr(trainer, capture)
     trainer.run(lambda progress: None)
     assert heldout_psnr(trainer, capture) > before
+
+
+@pytest.mark.parametrize("model", ["lite", "full"])
+def test_distorted_lenses_train_and_what_they_cannot_see_does_not_count(tmp_path: Path, model: str) -> None:
+    """A fisheye whose corners lie beyond what can be drawn: whatever the pictures have there, the run is the same."""
+    cameras = {
+        name: replace(camera, model="OPENCV_FISHEYE", distortion=(0.05, -0.01, 0.0, 0.0))
+        for name, camera in around(fx=21.0).items()
+    }
+    share = float(valid_pixels(cameras["cam01"]).to(torch.float32).mean())
+    assert 0.5 < share < 0.99
+    trainers, before = [], 0.0
+    for blind in (0, 255):
+        folder = tmp_path / str(blind)
+        folder.mkdir()
+        seen = recorded(folder, cameras, blind)
+        trainers.append(Trainer(seen, replace(QUICK, iterations=60, model=model), get_backend()))
+        if not before:
+            before = heldout_psnr(trainers[0], seen)
+            first = seen
+        trainers[-1].run(lambda progress: None)
+    assert_same(*trainers)
+    assert heldout_psnr(trainers[0], first) > before + 2
