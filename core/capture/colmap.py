@@ -16,6 +16,8 @@ from .colmap_model import find_model, points_file, read_cameras, write_model
 from .export import Export, file_names, write_pictures
 from .media import Media
 from .options import CaptureOptions
+from .picture_set import check_pictures
+from .video_set import natural
 
 _FOLDER = re.compile(r"colmap_(\d{1,7})")
 
@@ -53,7 +55,7 @@ def read(path: Path, options: CaptureOptions) -> Capture:
         if points:
             seeds[j] = points
     capture = Capture(
-        cameras={names[image]: replace(camera, name=names[image]) for image, camera in posed.items()},
+        cameras={name: replace(posed[image], name=name) for image, name in names.items()},
         images=images,
         frame_count=len(chosen),
         fps=options.fps or 30.0,
@@ -61,7 +63,7 @@ def read(path: Path, options: CaptureOptions) -> Capture:
         seeds=seeds,
         source=model,
     )
-    capture.check_files()
+    check_pictures(capture)
     return capture
 
 
@@ -75,8 +77,8 @@ def _frame_folders(path: Path) -> dict[int, Path]:
 
 
 def _camera_names(model: Path, posed: dict[str, Camera]) -> dict[str, str]:
-    """Call each camera by its picture's name without the ending; in the order of the names, as the authors sort."""
-    names = {image: str(Path(image).with_suffix("")) for image in sorted(posed)}
+    """Call each camera by its picture's name without the ending, in the order of the names, as the authors sort."""
+    names = {image: str(Path(image).with_suffix("")) for image in sorted(posed, key=natural)}
     if len(set(names.values())) < len(names):
         raise HoloreelError(f"{model}: two images differ in their ending only; keep one picture per camera.")
     return names

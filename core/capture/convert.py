@@ -11,6 +11,7 @@ from ..files import read_json, write_json
 from .capture import Capture
 from .export import Export
 from .layouts import LAYOUTS
+from .video_set import natural
 
 _RECORD = "job.json"
 
@@ -48,8 +49,9 @@ def _note_losses(capture: Capture, to: str, export: Export) -> None:
     if capture.seeds and not layout.holds_seeds:
         export.notes.append("Seed points are not taken along: run `holoreel sfm` on the result.")
     held_out = capture.camera_names("test")
-    if layout.held_out is not None and len(held_out) != 1:
+    default = min(capture.cameras, key=natural) if layout.keeps_names else "".join(held_out[:1])
+    if layout.held_out is not None and held_out != [default]:
         export.notes.append(
-            f"{', '.join(held_out) or 'No camera'} is held out, but the layout holds out one camera, the first: name "
-            "them by --test-cameras."
+            f"Held out were {', '.join(held_out) or 'no cameras'}, but this layout holds one out by default"
+            f"{', ' + default if default else ''}: name them by --test-cameras."
         )

@@ -20,7 +20,7 @@ from .capture import Capture
 from .export import Export, held_out_first, write_text, write_videos
 from .options import CaptureOptions
 from .rotations import matrix_from_vector, vector_from_matrix
-from .video_set import find_videos, pair, video_capture
+from .video_set import check_pairs, find_videos, video_capture
 
 FILE_NAME = "models.json"
 HELD_OUT = "camera_0001"
@@ -42,8 +42,9 @@ def read(path: Path, options: CaptureOptions) -> Capture:
         if camera.name in cameras:
             raise HoloreelError(f"{file}: [{index}].name {camera.name!r} is there twice; fetch it again.")
         cameras[camera.name] = camera
-    videos = pair(file, list(cameras), find_videos(path))
-    return video_capture(file, cameras, videos, options)
+    videos = find_videos(path)
+    check_pairs(file, list(cameras), videos)
+    return video_capture(file, {name: cameras[name] for name in videos}, videos, options)
 
 
 def _entries(file: Path) -> list[Any]:

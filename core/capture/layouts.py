@@ -27,6 +27,7 @@ class Layout:
     scale: int = 1  # by which the protocol divides the size of the pictures
     held_out: str | None = ""  # the camera to test on; the first where there is none of that name; None: the files say
     holds_seeds: bool = False
+    keeps_names: bool = False  # of cameras; the others number them, the held-out one in the place of `held_out`
 
 
 def _read_nerfstudio(path: Path, options: CaptureOptions) -> Capture:
@@ -57,11 +58,12 @@ def _write_nerfstudio(capture: Capture, path: Path, export: Export) -> None:
 LAYOUTS = {
     "nerfstudio": Layout(
         nerfstudio.FILE_NAME,
-        lambda path: path.name == nerfstudio.FILE_NAME or (path / nerfstudio.FILE_NAME).is_file(),
+        lambda path: (path.suffix.lower() == ".json" and not path.is_dir()) or (path / nerfstudio.FILE_NAME).is_file(),
         _read_nerfstudio,
         _write_nerfstudio,
         held_out=None,
         holds_seeds=True,
+        keeps_names=True,
     ),
     "n3v": Layout("cam??.mp4 and poses_bounds.npy", n3v.matches, n3v.read, n3v.write, scale=2),
     "technicolor": Layout(
@@ -80,9 +82,14 @@ LAYOUTS = {
         held_out=immersive.HELD_OUT,
     ),
     "colmap": Layout(
-        "images and sparse/0, or folders colmap_FRAME", colmap.matches, colmap.read, colmap.write, holds_seeds=True
+        "images and sparse/0, or folders colmap_FRAME",
+        colmap.matches,
+        colmap.read,
+        colmap.write,
+        holds_seeds=True,
+        keeps_names=True,
     ),
-    "videos": Layout("a video per camera", videos.matches, videos.read, videos.write),
+    "videos": Layout("a video per camera", videos.matches, videos.read, videos.write, keeps_names=True),
 }
 
 
@@ -114,8 +121,6 @@ def find_layout(path: Path, options: CaptureOptions) -> str:
                 "folder of one, or another --layout."
             )
         return options.layout
-    if path.suffix.lower() == ".json" and not path.is_dir():
-        return "nerfstudio"
     for name, layout in LAYOUTS.items():
         if layout.matches(path):
             return name

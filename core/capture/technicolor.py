@@ -16,6 +16,7 @@ from .export import Export, held_out_first, pinhole, write_pictures, write_text
 from .images import picture_size
 from .media import Media
 from .options import CaptureOptions
+from .picture_set import check_pictures
 from .rotations import matrix_from_quaternion, quaternion_from_matrix
 
 FILE_NAME = "cameras_parameters.txt"
@@ -61,7 +62,7 @@ def read(path: Path, options: CaptureOptions) -> Capture:
     images: dict[View, Media] = {
         (f"cam{c:02d}", j): pictures[c, n] for j, n in enumerate(chosen) for c in range(len(rows))
     }
-    return Capture(
+    capture = Capture(
         cameras=cameras,
         images=images,
         frame_count=len(chosen),
@@ -69,6 +70,8 @@ def read(path: Path, options: CaptureOptions) -> Capture:
         frame_start=chosen.start,
         source=file,
     )
+    check_pictures(capture)
+    return capture
 
 
 def _rows(file: Path) -> list[list[float]]:

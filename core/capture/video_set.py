@@ -37,8 +37,8 @@ def natural(name: str) -> list[tuple[int, str]]:
     return [(int(part), "") if part.isdigit() else (-1, part) for part in re.split(r"(\d+)", name) if part]
 
 
-def pair(source: Path, wanted: Sequence[str], videos: Mapping[str, Path]) -> dict[str, Path]:
-    """Return the video of each camera that `source` describes; none may be missing and none left over."""
+def check_pairs(source: Path, wanted: Sequence[str], videos: Mapping[str, Path]) -> None:
+    """Raise `HoloreelError` unless each camera that `source` describes has a video, and each video a camera."""
     missing = [name for name in wanted if name not in videos]
     extra = [name for name in videos if name not in wanted]
     if missing:
@@ -51,7 +51,6 @@ def pair(source: Path, wanted: Sequence[str], videos: Mapping[str, Path]) -> dic
             f"{videos[extra[0]]}{_more(extra)} is not described in {source.name}; "
             "fetch the matching file of cameras, or move the video away."
         )
-    return {name: videos[name] for name in wanted}
 
 
 def _more(names: Sequence[str]) -> str:

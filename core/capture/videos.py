@@ -23,7 +23,7 @@ from .media import Media, VideoFacts, VideoFrame
 from .options import CaptureOptions
 from .sync import FILE_NAME as TIMESTAMPS
 from .sync import read_timestamps, synchronize
-from .video_set import check_sizes, find_videos, pair, probe_all, video_capture
+from .video_set import check_pairs, check_sizes, find_videos, probe_all, video_capture
 
 _GUESSED_FOCAL = 0.8  # of the longer side, until structure from motion knows better
 
@@ -63,7 +63,7 @@ def _read_calibrated(path: Path, calibration: Path, options: CaptureOptions) -> 
         if name in cameras:
             raise HoloreelError(f"{calibration}: two cameras mean the video {name}; give each one its own name.")
         cameras[name] = replace(entry.camera, name=name)
-    videos = pair(calibration, list(cameras), videos)
+    check_pairs(calibration, list(cameras), videos)
     cameras = {name: cameras[name] for name in videos}
     return _capture(path, calibration, cameras, videos, probe_all(videos), options)
 

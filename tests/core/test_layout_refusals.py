@@ -137,6 +137,22 @@ def test_a_damaged_video(scene: Callable[[str], Path], layout: str, content: byt
     refuse(folder, VIDEO_NAMES[layout])
 
 
+@pytest.mark.parametrize("layout", ["immersive", "videos"])
+def test_the_first_camera_is_the_first_by_name(scene: Callable[[str], Path], layout: str) -> None:
+    """Whatever the order in the file."""
+    folder = scene(layout)
+    before = read_capture(folder)
+    edit_json(
+        folder / ("models.json" if layout == "immersive" else "cameras_opencv.json"), lambda entries: entries.reverse()
+    )
+    after = read_capture(folder)
+    assert list(after.cameras) == list(before.cameras)
+    assert after.camera_names("test") == [next(iter(before.cameras))]
+    for name, camera in before.cameras.items():
+        np.testing.assert_array_equal(after.cameras[name].world_to_camera, camera.world_to_camera)
+        assert after.images[name, 2] == before.images[name, 2]
+
+
 def test_videos_of_half_the_size_that_the_poses_were_made_for(scene: Callable[[str], Path]) -> None:
     """LLFF's poses scale along with the pictures; other layouts' lenses say for which size they hold."""
     folder = scene("n3v")
@@ -212,8 +228,10 @@ def test_missing_technicolor_pictures(scene: Callable[[str], Path]) -> None:
 
 def test_technicolor_pictures_of_another_size_or_none(scene: Callable[[str], Path]) -> None:
     folder = scene("technicolor")
-    (folder / "technicolor_undist_00000_01.png").write_bytes(b"not a picture")
-    refuse(folder, "technicolor_undist_00000_01.png")
+    iio.imwrite(folder / "technicolor_undist_00003_01.png", np.zeros((17, 32, 3), np.uint8))
+    refuse(folder, "technicolor_undist_00003_01.png is 32x17, but camera 'cam01' is 32x16")
+    (folder / "technicolor_undist_00003_01.png").write_bytes(b"not a picture")
+    refuse(folder, "technicolor_undist_00003_01.png cannot be read as a picture")
 
 
 @pytest.mark.parametrize(
@@ -363,6 +381,11 @@ MODEL = "colmap_0/sparse/0/"
         (lambda folder: shutil.rmtree(folder / "colmap_2"), "colmap_2 is missing"),
         (lambda folder: shutil.rmtree(folder / "colmap_0" / "sparse"), "holds no sparse/0/cameras.bin"),
         (lambda folder: (folder / "colmap_3/images/cam01.png").unlink(), "cam01.png"),
+        (lambda folder: (folder / "colmap_3/images/cam01.png").write_bytes(b""), "cannot be read as a picture"),
+        (
+            damage(MODEL + "cameras.bin", lambda data: data[:16] + struct.pack("<Q", 48) + data[24:]),
+            "32x16, but camera",
+        ),
         (damage(MODEL + "cameras.bin", lambda data: data[:-1]), "ends at byte"),
         (damage(MODEL + "cameras.bin", lambda data: struct.pack("<Q", 2**60) + data[8:]), "more than it can hold"),
         (damage(MODEL + "cameras.bin", lambda data: data[:12] + struct.pack("<i", 7) + data[16:]), "model number 7"),
