@@ -22,6 +22,7 @@ Array = NDArray[np.float64]
 MAX_SIZE = 1 << 16  # pixels along one side
 MAX_COORDINATE = 1e15  # of a camera's place
 MAX_DISTORTION = 1e6  # of one distortion parameter
+BLOCK = 1 << 13  # pixels inverted at once, whose temporaries fit a processor's cache
 RIGID_TOLERANCE = 1e-3  # largest entry of RᵀR − 1 that still counts as rounding
 
 
@@ -147,7 +148,9 @@ class Camera:
 
     def _directions(self, uv: ArrayLike) -> Array:
         plane = (np.asarray(uv, np.float64) - (self.cx, self.cy)) / (self.fx, self.fy)
-        return MODELS[self.model].from_plane(self.distortion, plane)
+        from_plane = MODELS[self.model].from_plane
+        blocks = [from_plane(self.distortion, plane[i : i + BLOCK]) for i in range(0, max(len(plane), 1), BLOCK)]
+        return blocks[0] if len(blocks) == 1 else np.concatenate(blocks)
 
     def _to_world(self, directions: Array) -> Array:
         return directions @ self.world_to_camera[:3, :3]
