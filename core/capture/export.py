@@ -155,7 +155,7 @@ class _Lenses:
 
 def _note_lenses(capture: Capture, targets: Mapping[str, Camera], export: Export) -> None:
     changed = [name for name in targets if not same_lens(capture.cameras[name], targets[name])]
-    if changed:
+    if changed and export.rectify is None:
         export.notes.append(
             f"Pictures of {len(changed)} of {len(targets)} cameras are resampled: "
             "the layout cannot describe their lenses."

@@ -437,3 +437,15 @@ def test_real_webcams(shared_data: Callable[[str], Path], tmp_path: Path) -> Non
         np.testing.assert_allclose(camera.K, again.cameras[name].K)
     with pytest.raises(HoloreelError, match=r"camera cam_2 is \+18.1 ms from the common clock.*--sync-tolerance 0.11"):
         read_capture(folder, sync_tolerance=0.05)
+
+
+@pytest.mark.parametrize("model", COLMAP)
+def test_a_lens_seen_through_itself(model: str) -> None:
+    """Nothing changes; and through a lens shifted by whole pixels, the picture is shifted, black where it ends."""
+    lens = Camera(40, 30, 60.0, 61.0, 18.5, 16.0, model=model, distortion=COLMAP[model])
+    picture = np.random.default_rng(2).integers(0, 255, (30, 40, 3), dtype=np.uint8)
+    np.testing.assert_array_equal(lens_map(lens, lens).apply(picture), picture)
+    shifted = lens_map(lens, replace(lens, cx=18.5 + 3, cy=16.0 - 2)).apply(picture)
+    np.testing.assert_array_equal(shifted[:28, 3:], picture[2:, :37])
+    assert not shifted[:, :3].any()
+    assert not shifted[28:].any()
