@@ -105,5 +105,5 @@ def _check_rest(count: int, features: Tensor, background: Tensor | None, density
         for name, dtype in (("gradient", torch.float32), ("views", torch.int32), ("radius_px", torch.float32)):
             tensor = getattr(density, name)
             _check_shapes(**{f"density.{name}": (tensor, (count,))})
-            if tensor.dtype != dtype or not tensor.is_contiguous() or tensor.device.type != "cpu":
-                raise ValueError(f"density.{name} must be a contiguous {dtype} tensor on the CPU")
+            if tensor.dtype != dtype or not tensor.is_contiguous() or tensor.device != features.device:
+                raise ValueError(f"density.{name} must be a contiguous {dtype} tensor, where the Gaussians are")

@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""What every rasterizer backend promises. Backends: `cpu` (our C++ kernels) and `reference` (plain torch, the oracle).
+"""What every rasterizer backend promises.
+
+Backends: `cpu` (our C++ kernels), `reference` (plain torch, the oracle) and `cuda` (gsplat, on an NVIDIA GPU).
 
 Each backend module has the functions `rasterize`, `rasterize_spacetime` and `decode` with the signatures below; they
 are differentiable with respect to every tensor argument.
@@ -36,6 +38,9 @@ Gaussians are drawn in the order of their camera-space z, rounded to single prec
 rows. A row is skipped, and gets zero gradient, where a parameter is not finite (but an infinite `trbf_log_scale` means
 always on), where the opacity at `time` is under `alpha_min`, or where its 2D covariance cannot be inverted. A zero
 quaternion means no rotation. Renderings are float32, or for `reference` of the dtype of the means.
+
+A backend's `DEVICE` says where its pictures lie and where tensors are best kept; they are brought there if they lie
+elsewhere. `cuda` has a few rules of its own, which its module names, and so is held to wider tolerances.
 """
 
 import math

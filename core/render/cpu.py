@@ -33,7 +33,10 @@ from .native import (
     set_threads,
 )
 
+DEVICE = "cpu"
+
 __all__ = [
+    "DEVICE",
     "adam",
     "adam_step",
     "decode",

@@ -9,7 +9,6 @@ import math
 from collections.abc import Callable, Iterator, Sequence
 from typing import NamedTuple
 
-import numpy as np
 import torch
 from torch import Tensor
 from torch.utils.checkpoint import checkpoint
@@ -18,6 +17,7 @@ from ..camera import Camera
 from .checks import check_adam, check_decoder, check_gaussians, check_images, check_pinhole, check_spacetime
 from .contract import AdamGroup, DensityStats, PictureLoss, Rendering, Rules, SpacetimeTensors
 
+DEVICE = "cpu"  # where nothing says otherwise; it works wherever its arguments lie
 TILE = 16
 GROUP_ELEMENTS = 3_000_000  # of (Gaussian, pixel) pairs composited at once
 GRAPH_ELEMENTS = 150_000_000  # beyond this many in a picture, groups are computed again in the backward pass
@@ -62,10 +62,16 @@ def rasterize(
     rules = rules or Rules()
     check_pinhole(camera)
     check_gaussians(means, quats, scales, opacities, features, background, density)
-    with torch.no_grad():
-        rows = torch.nonzero(_finite(means, quats, scales, features) & (opacities >= rules.alpha_min))[:, 0]
-    arrays = (means, quats, scales, opacities, features)
+    arrays = Gaussians3D(means, quats, scales, opacities, features)
+    rows = drawable(arrays, rules)
     return _render(lambda chosen: Gaussians3D(*(a[chosen] for a in arrays)), rows, camera, background, rules, density)
+
+
+def drawable(g: Gaussians3D, rules: Rules) -> Tensor:
+    """Return the rows, (M,), that are finite and opaque enough to be seen."""
+    with torch.no_grad():
+        good = _finite(g.means, g.quats, g.scales, g.features) & (g.opacities >= rules.alpha_min)
+        return torch.nonzero(good)[:, 0]
 
 
 def rasterize_spacetime(
@@ -80,18 +86,22 @@ def rasterize_spacetime(
     rules = rules or Rules()
     check_pinhole(camera)
     check_spacetime(gaussians, background, density)
-    g = gaussians
+    rows = alive(gaussians, time, rules)
+
+    def at_time(chosen: Tensor) -> Gaussians3D:
+        return evaluate(SpacetimeTensors(*(array[chosen] for array in gaussians)), time, rules)
+
+    return _render(at_time, rows, camera, background, rules, density)
+
+
+def alive(g: SpacetimeTensors, time: float, rules: Rules) -> Tensor:
+    """Return the rows, (M,), that are finite and opaque enough at `time` to be seen."""
     with torch.no_grad():
         finite = _finite(g.means, g.motions, g.quats, g.omegas, g.log_scales, g.opacity_logits, g.features)
         finite &= torch.isfinite(g.trbf_centers) & ~torch.isnan(g.trbf_log_scales)
         rows = torch.nonzero(finite)[:, 0]
         opacities = _opacities(g.opacity_logits[rows], time - g.trbf_centers[rows], g.trbf_log_scales[rows])
-        rows = rows[opacities >= rules.alpha_min]
-
-    def at_time(chosen: Tensor) -> Gaussians3D:
-        return evaluate(SpacetimeTensors(*(array[chosen] for array in g)), time, rules)
-
-    return _render(at_time, rows, camera, background, rules, density)
+        return rows[opacities >= rules.alpha_min]
 
 
 def evaluate(g: SpacetimeTensors, time: float, rules: Rules | None = None) -> Gaussians3D:
@@ -304,12 +314,26 @@ def _watch_density(splats: Splats, camera: Camera, rules: Rules, density: Densit
 def decode(features: Tensor, camera: Camera, hidden: Tensor, output: Tensor, activation: str) -> Tensor:
     """Turn the features of a full model's rendering into colors; shapes and meanings as in `contract`."""
     check_decoder(features, camera, hidden, output, activation)
-    rays = np.concatenate(camera.rays(), 1).reshape(camera.height, camera.width, 6)
-    inputs = torch.cat((features[..., 3:], torch.tensor(rays, dtype=features.dtype, device=features.device)), 2)
-    colors = features[..., :3] + torch.relu(inputs @ hidden.T) @ output.T
+    origin = torch.tensor(camera.center.tolist(), dtype=features.dtype, device=features.device)
+    units = features[..., 3:] @ hidden[:, :6].T + directions(camera, features) @ hidden[:, 9:].T
+    colors = features[..., :3] + torch.relu(units + hidden[:, 6:9] @ origin) @ output.T
     if activation == "sigmoid":
         return torch.sigmoid(colors)
     return colors.clamp(0, 1) if activation == "clamp" else colors
+
+
+def directions(camera: Camera, like: Tensor) -> Tensor:
+    """Return (H, W, 3) unit directions in the world through all pixel centers of a pinhole, where and as `like` is."""
+    turn = torch.tensor(camera.world_to_camera[:3, :3].tolist(), dtype=like.dtype, device=like.device)
+    x, y = (
+        ((torch.arange(count, dtype=torch.float64) + 0.5 - center) / focal).to(like.device, like.dtype)
+        for count, center, focal in (
+            (camera.width, camera.cx, camera.fx),
+            (camera.height, camera.cy, camera.fy),
+        )
+    )
+    local = torch.stack((*torch.meshgrid(x, y, indexing="xy"), torch.ones_like(x).expand(len(y), len(x))), 2)
+    return torch.nn.functional.normalize(local, dim=2) @ turn
 
 
 def ssim_map(image: Tensor, target: Tensor) -> Tensor:

@@ -6,9 +6,10 @@ import sys
 import warnings
 
 import pytest
+import torch
 from holoreel.core import render
 from holoreel.core.errors import HoloreelError
-from holoreel.core.render import native
+from holoreel.core.render import cuda, native
 
 
 @pytest.fixture
@@ -71,7 +72,33 @@ def test_number_of_threads(monkeypatch, text, threads):
 
 def test_unknown_backend():
     with pytest.raises(ValueError, match="no rasterizer backend"):
+        render.get_backend("opengl")
+
+
+def test_without_a_gpu_cuda_is_refused_with_a_remedy(monkeypatch):
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    with pytest.raises(HoloreelError, match=r"no NVIDIA GPU.*pip install"):
         render.get_backend("cuda")
+
+
+def test_without_gsplat_cuda_is_refused_with_a_remedy(monkeypatch):
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setitem(sys.modules, "gsplat.cuda._backend", None)
+    with pytest.raises(HoloreelError, match=r"gsplat.*pip install"):
+        render.get_backend("cuda")
+
+
+def test_auto_takes_the_gpu_where_it_can_and_warns_where_it_cannot(monkeypatch):
+    monkeypatch.setattr(render, "_warned", False)
+    monkeypatch.setattr(render, "_gpu_is_wanted", lambda: True)
+    monkeypatch.setattr(cuda, "load_kernels", lambda: None)
+    assert render.get_backend() is cuda
+    monkeypatch.undo()
+    monkeypatch.setattr(render, "_warned", False)
+    monkeypatch.setattr(render, "_gpu_is_wanted", lambda: True)
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    with pytest.warns(UserWarning, match="Until then the CPU is used"):
+        assert render.get_backend().__name__ == "holoreel.core.render.cpu"
 
 
 def test_importing_the_package_does_not_import_torch():

@@ -1,0 +1,168 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The `cuda` backend: the contract on an NVIDIA GPU, by gsplat (https://github.com/nerfstudio-project/gsplat).
+
+Arguments may lie anywhere; they are brought to the GPU, and pictures are left there. What is on the GPU already is not
+copied, so whoever keeps model, pictures and density statistics there (`DEVICE`) never waits for a transfer.
+
+gsplat has rules of its own, whatever `Rules` says: alpha is capped at 0.999 instead of 0.99; a pixel skips alphas under
+1/255, and is full before the Gaussian that would take its transmittance to 1e-4 or less; the Jacobian is held with a
+margin of 0.15. So pictures differ from the other backends' where Gaussians are nearly opaque. `tests/core/
+test_render_cards.py` holds them to `reference` with the cap of 0.999.
+"""
+
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from ..camera import Camera
+from ..errors import HoloreelError
+from . import reference
+from .checks import check_decoder, check_gaussians, check_pinhole, check_spacetime
+from .contract import AdamGroup, DensityStats, PictureLoss, Rendering, Rules, SpacetimeTensors
+from .reference import Gaussians3D
+
+DEVICE = "cuda"
+REMEDY = "install Holoreel with `pip install -e '.[cuda]'` beside a torch for CUDA and its compiler, nvcc"
+
+
+def load_kernels() -> None:
+    """Make sure that gsplat can run. Raises HoloreelError with what is missing."""
+    if not torch.cuda.is_available():
+        raise HoloreelError(
+            "torch sees no NVIDIA GPU, which the cuda backend needs: take --backend cpu, or " + REMEDY + "."
+        )
+    try:
+        from gsplat.cuda._backend import _C
+    except ImportError as error:
+        raise HoloreelError(f"gsplat, which draws on the GPU, cannot be loaded ({error}): {REMEDY}.") from error
+    if _C is None:
+        raise HoloreelError(f"gsplat's kernels, which draw on the GPU, cannot be compiled: {REMEDY}.")
+
+
+def rasterize(
+    means: Tensor,
+    quats: Tensor,
+    scales: Tensor,
+    opacities: Tensor,
+    features: Tensor,
+    camera: Camera,
+    background: Tensor | None = None,
+    rules: Rules | None = None,
+    density: DensityStats | None = None,
+) -> Rendering:
+    """Render 3D Gaussians; shapes and meanings as in `contract`, float32 on the GPU."""
+    rules = rules or Rules()
+    check_pinhole(camera)
+    check_gaussians(means, quats, scales, opacities, features, background, density)
+    everything = Gaussians3D(*map(_there, (means, quats, scales, opacities, features)))
+    rows = reference.drawable(everything, rules)
+    return _render(Gaussians3D(*(array[rows] for array in everything)), rows, camera, background, rules, density)
+
+
+def rasterize_spacetime(
+    gaussians: SpacetimeTensors,
+    time: float,
+    camera: Camera,
+    background: Tensor | None = None,
+    rules: Rules | None = None,
+    density: DensityStats | None = None,
+) -> Rendering:
+    """Render Spacetime Gaussians at `time`; shapes and meanings as in `contract`, float32 on the GPU."""
+    rules = rules or Rules()
+    check_pinhole(camera)
+    check_spacetime(gaussians, background, density)
+    everything = SpacetimeTensors(*map(_there, gaussians))
+    rows = reference.alive(everything, time, rules)
+    chosen = SpacetimeTensors(*(array[rows] for array in everything))
+    return _render(reference.evaluate(chosen, time, rules), rows, camera, background, rules, density)
+
+
+def decode(features: Tensor, camera: Camera, hidden: Tensor, output: Tensor, activation: str) -> Tensor:
+    """Turn the features of a full model's rendering into colors; shapes and meanings as in `contract`."""
+    check_decoder(features, camera, hidden, output, activation)
+    return reference.decode(_there(features), camera, _there(hidden), _there(output), activation)
+
+
+def picture_loss(image: Tensor, target: Tensor, weight_dssim: float) -> PictureLoss:
+    """Return the training loss and the mean squared error of two images, as in `contract`."""
+    return reference.picture_loss(image, target.to(image.device, non_blocking=True), weight_dssim)
+
+
+def l1_dssim(image: Tensor, target: Tensor, weight_dssim: float) -> Tensor:
+    """Return the training loss of two images alone."""
+    return picture_loss(image, target, weight_dssim).loss
+
+
+def adam(groups: Sequence[AdamGroup], beta1: float, beta2: float, eps: float, step: int) -> None:
+    """Take one step of Adam, in place, as in `contract`, wherever the tensors lie.
+
+    gsplat's SelectiveAdam, which steps only what a picture saw, has no bias correction and so is another optimizer.
+    """
+    reference.adam(groups, beta1, beta2, eps, step)
+
+
+def _there(tensor: Tensor) -> Tensor:
+    return tensor.to(DEVICE, torch.float32)
+
+
+def camera_arguments(camera: Camera, like: Tensor) -> dict[str, Any]:
+    """Return what gsplat is told of a camera."""
+    placed: dict[str, Any] = {"dtype": like.dtype, "device": like.device}
+    return {
+        "viewmats": torch.tensor(camera.world_to_camera.tolist(), **placed)[None],
+        "Ks": torch.tensor(camera.K.tolist(), **placed)[None],
+        "width": camera.width,
+        "height": camera.height,
+    }
+
+
+def gaussian_arguments(g: Gaussians3D) -> dict[str, Tensor]:
+    """Return what gsplat is told of Gaussians; it does not know that a zero quaternion means no rotation."""
+    identity = torch.tensor([1.0, 0.0, 0.0, 0.0], dtype=g.quats.dtype, device=g.quats.device)
+    turned = g.quats.norm(dim=1, keepdim=True) >= reference.MIN_QUAT_NORM
+    quats = torch.where(turned, g.quats, identity)
+    return {"means": g.means, "quats": quats, "scales": g.scales, "opacities": g.opacities, "colors": g.features}
+
+
+def _render(
+    gaussians: Gaussians3D,
+    rows: Tensor,
+    camera: Camera,
+    background: Tensor | None,
+    rules: Rules,
+    density: DensityStats | None,
+) -> Rendering:
+    from gsplat import rasterization
+
+    pictures, alpha, seen = rasterization(
+        **gaussian_arguments(gaussians),
+        **camera_arguments(camera, gaussians.means),
+        near_plane=rules.near,
+        eps2d=rules.low_pass,
+        backgrounds=None if background is None else _there(background)[None],
+        render_mode="RGB+ED",
+        # Rows were chosen already, so few fall outside the picture: packing them would cost more than it saves.
+        packed=False,
+    )
+    if density is not None and seen["means2d"].requires_grad:
+        _watch_density(seen, rows, density)
+    return Rendering(pictures[0, ..., :-1], alpha[0, ..., 0], pictures[0, ..., -1])
+
+
+def _watch_density(seen: dict[str, Any], rows: Tensor, density: DensityStats) -> None:
+    """Let the backward pass add to `density`, wherever that lies."""
+    drawn = (seen["radii"][0] > 0).all(dim=1)
+    xx, xy, yy = seen["conics"].detach()[0][drawn].unbind(1)  # of the inverse covariance
+    determinant = xx * yy - xy * xy
+    longest = (0.5 * (xx + yy) + torch.sqrt((0.5 * (xx - yy)) ** 2 + xy**2)) / determinant
+    place = density.gradient.device
+    which, radii = rows[drawn].to(place), (3.0 * longest.sqrt()).to(place)
+
+    def add(gradient: Tensor) -> None:
+        density.gradient[which] += gradient[0][drawn].norm(dim=1).to(place)
+        density.views[which] += 1
+        density.radius_px[which] = torch.maximum(density.radius_px[which], radii)
+
+    seen["means2d"].register_hook(add)

@@ -1,0 +1,211 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""One table of scenes that every backend draws as the float64 oracle does: pictures, gradients, statistics.
+
+The backends that run on a GPU are skipped by name where there is none.
+"""
+
+import math
+from dataclasses import replace
+from typing import NamedTuple
+
+import pytest
+import torch
+from holoreel.core.camera import Camera
+from holoreel.core.errors import HoloreelError
+from holoreel.core.render import get_backend, reference
+from holoreel.core.render.contract import AdamGroup, DensityStats, Rules, SpacetimeTensors
+from holoreel.core.render.scenes import random_scene
+
+TIME = 0.4
+
+
+class Promise(NamedTuple):
+    """What a backend is held to."""
+
+    rules: Rules  # the oracle's: those the backend has
+    bad_pixels: float  # the part of pixels that may differ by more than `pixel`: a decision may fall the other way
+    pixel: float
+    gradient: float  # relative, L2
+
+
+PROMISES = {
+    "cpu": Promise(Rules(), 0.01, 2e-6, 2e-4),
+    "cuda": Promise(Rules(alpha_max=0.999), 0.01, 1e-4, 2e-2),
+}
+
+
+def plain(channels):
+    """An ordinary scene."""
+    return random_scene(1200, 160, 112, channels, seed=2)
+
+
+def off_center():
+    """The principal point lies outside the picture, whose sides are no multiples of a tile."""
+    gaussians, camera = random_scene(900, 131, 83, 3, seed=3)
+    shift = 0.7 * camera.width
+    gaussians.means[:, 0] -= shift / camera.fx * gaussians.means[:, 2]
+    return gaussians, replace(camera, cx=camera.cx + shift, fy=1.1 * camera.fy)
+
+
+def turned():
+    """A camera elsewhere."""
+    gaussians, camera = random_scene(900, 96, 64, 3, seed=4)
+    pose = torch.eye(4, dtype=torch.float64)
+    pose[0, 0] = pose[2, 2] = math.cos(0.3)
+    pose[0, 2], pose[2, 0] = math.sin(0.3), -math.sin(0.3)
+    pose[:3, 3] = torch.tensor([-0.6, 0.2, 0.4])
+    return gaussians, replace(camera, world_to_camera=pose.numpy())
+
+
+def trouble():
+    """Rows that are not finite, unrotated, dead, always on, behind the camera, or one before the other."""
+    gaussians, camera = random_scene(600, 80, 60, 3, seed=5)
+    gaussians.means[:10] = math.nan
+    gaussians.log_scales[10:20] = math.inf
+    gaussians.quats[20:60], gaussians.omegas[20:60] = 0, 0
+    gaussians.trbf_log_scales[60:90] = -6.0
+    gaussians.trbf_log_scales[90:120] = math.inf
+    gaussians.means[120:150, 2] *= -1
+    return gaussians, camera
+
+
+def nothing():
+    """No Gaussian at all."""
+    gaussians, camera = random_scene(5, 40, 30, 3)
+    return SpacetimeTensors(*(array[:0] for array in gaussians)), camera
+
+
+CARDS = {
+    "1 channel": lambda: plain(1),
+    "3 channels": lambda: plain(3),
+    "9 channels": lambda: plain(9),
+    "16 channels": lambda: plain(16),
+    "off center": off_center,
+    "turned": turned,
+    "trouble": trouble,
+    "nothing": nothing,
+}
+
+
+@pytest.fixture(params=sorted(PROMISES))
+def backend(request):
+    """Yield (backend, its promise)."""
+    try:
+        return get_backend(request.param), PROMISES[request.param]
+    except HoloreelError as error:
+        pytest.skip(f"{request.param}: {error}")
+
+
+def draw(backend, dtype, gaussians, camera, rules, incoming):
+    """Return pictures, gradients of all arrays and the background, and the density statistics."""
+    device = backend.DEVICE
+    arrays = [array.detach().to(device, dtype, copy=True).requires_grad_() for array in gaussians]
+    background = torch.linspace(0.1, 0.9, gaussians.features.shape[1]).to(device, dtype).requires_grad_()
+    count = len(gaussians.means)
+    density = DensityStats(
+        torch.zeros(count, device=device),
+        torch.zeros(count, dtype=torch.int32, device=device),
+        torch.zeros(count, device=device),
+    )
+    pictures = backend.rasterize_spacetime(SpacetimeTensors(*arrays), TIME, camera, background, rules, density)
+    sum((p * g.to(device, dtype)).sum() for p, g in zip(pictures, incoming, strict=True)).backward()
+    gradients = [torch.zeros_like(a) if a.grad is None else a.grad for a in (*arrays, background)]
+    return *([tensor.detach().double().cpu() for tensor in group] for group in (pictures, gradients)), density
+
+
+@pytest.mark.parametrize("card", CARDS)
+def test_card(backend, card):
+    backend, promise = backend
+    gaussians, camera = CARDS[card]()
+    generator = torch.Generator().manual_seed(0)
+    size = (camera.height, camera.width)
+    incoming = [torch.randn(*size, *rest, generator=generator) for rest in ((gaussians.features.shape[1],), (), ())]
+    rules = promise.rules
+    oracle, _, _ = draw(reference, torch.float64, gaussians, camera, rules, incoming)
+    ours, _, _ = draw(backend, torch.float32, gaussians, camera, rules, incoming)
+    depth_scale = oracle[2].clamp(min=1)
+    apart = torch.stack(
+        (
+            (ours[0] - oracle[0]).abs().amax(2),
+            (ours[1] - oracle[1]).abs(),
+            (ours[2] - oracle[2]).abs() / depth_scale,
+        )
+    ).amax(0)
+    solid = apart <= promise.pixel
+    assert (~solid).double().mean() <= promise.bad_pixels
+    # Where a decision fell the other way, the gradient is another one too: it is asked for elsewhere alone.
+    incoming = [gradient * (solid[..., None] if gradient.ndim == 3 else solid) for gradient in incoming]
+    _, wanted, statistics = draw(reference, torch.float64, gaussians, camera, rules, incoming)
+    _, got, ours_statistics = draw(backend, torch.float32, gaussians, camera, rules, incoming)
+    for name, a, b in zip((*SpacetimeTensors._fields, "background"), got, wanted, strict=True):
+        assert (a - b).norm() <= promise.gradient * b.norm() + 1e-12, name
+    pull, wanted_pull = ours_statistics.gradient.cpu().double(), statistics.gradient.double()
+    assert (pull - wanted_pull).norm() <= promise.gradient * wanted_pull.norm() + 1e-12
+    assert (ours_statistics.views.cpu() != statistics.views).double().sum() <= 0.05 * len(gaussians.means)
+
+
+@pytest.mark.parametrize("activation", ["none", "clamp", "sigmoid"])
+def test_decode_card(backend, activation):
+    backend, promise = backend
+    generator = torch.Generator().manual_seed(1)
+    camera = Camera(37, 23, 30.0, 32.0, 5.0, 30.0)
+    shapes = ((23, 37, 9), (6, 12), (3, 6))
+    values = [torch.randn(shape, generator=generator) for shape in shapes]
+    incoming = torch.randn(23, 37, 3, generator=generator)
+    results = []
+    for module, dtype in ((reference, torch.float64), (backend, torch.float32)):
+        features, hidden, output = (value.to(module.DEVICE, dtype, copy=True).requires_grad_() for value in values)
+        colors = module.decode(features, camera, hidden, output, activation)
+        colors.backward(incoming.to(module.DEVICE, dtype))
+        results.append([tensor.detach().double().cpu() for tensor in (colors, features.grad, hidden.grad, output.grad)])
+    for ours, oracle in zip(results[1], results[0], strict=True):
+        assert (ours - oracle).norm() <= promise.gradient * oracle.norm()
+
+
+def test_training_card(backend):
+    backend, _ = backend
+    generator = torch.Generator().manual_seed(2)
+    image = torch.rand(40, 50, 3, generator=generator)
+    target = (255 * torch.rand(40, 50, 3, generator=generator)).to(torch.uint8)
+    results = []
+    for module, dtype in ((reference, torch.float64), (backend, torch.float32)):
+        picture = image.to(module.DEVICE, dtype, copy=True).requires_grad_()
+        loss, squared_error = module.picture_loss(picture, target, 0.2)
+        loss.backward()
+        results.append((float(loss.detach()), squared_error, picture.grad.double().cpu()))
+    assert results[1][0] == pytest.approx(results[0][0], rel=1e-5)
+    assert results[1][1] == pytest.approx(results[0][1], rel=1e-5)
+    assert (results[1][2] - results[0][2]).norm() <= 1e-3 * results[0][2].norm()
+    value, moments = torch.ones(7, 3, device=backend.DEVICE), torch.zeros(2, 7, 3, device=backend.DEVICE)
+    gradient = torch.ones(7, 3, device=backend.DEVICE)
+    backend.adam([AdamGroup(value, gradient, moments[0], moments[1], 0.1)], 0.9, 0.99, 1e-15, 1)
+    torch.testing.assert_close(value.cpu(), torch.full((7, 3), 0.9))
+
+
+@pytest.mark.parametrize("card", ["3 channels", "off center", "turned"])
+def test_gsplat_is_told_the_same_scene(card):
+    """gsplat's own torch projection, which needs no GPU, makes of what it is told what ours makes of the scene."""
+    pytest.importorskip("gsplat")
+    from gsplat.cuda._torch_impl import _fully_fused_projection
+    from gsplat.cuda._torch_impl import _quat_scale_to_covar_preci as covariances
+    from holoreel.core.render import cuda
+
+    gaussians, camera = CARDS[card]()
+    gaussians = SpacetimeTensors(*(array.double() for array in gaussians))
+    rules = Rules()
+    rows = reference.alive(gaussians, TIME, rules)
+    still = reference.evaluate(SpacetimeTensors(*(array[rows] for array in gaussians)), TIME, rules)
+    told = cuda.gaussian_arguments(still)
+    matrices, _ = covariances(told["quats"], told["scales"], True, False)
+    _, means, depths, conics, _ = _fully_fused_projection(
+        told["means"],
+        matrices,
+        **cuda.camera_arguments(camera, still.means),
+        eps2d=rules.low_pass,
+        near_plane=rules.near,
+    )
+    ours = reference.project(still, torch.arange(len(rows)), camera, rules)
+    assert len(ours.rows) > 0.5 * len(rows)
+    torch.testing.assert_close(means[0, ours.rows], ours.means)
+    torch.testing.assert_close(depths[0, ours.rows], ours.depths)
+    torch.testing.assert_close(conics[0, ours.rows], ours.conics)
