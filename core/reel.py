@@ -34,9 +34,9 @@ COLOR_SPACES = ("display",)  # colors are sRGB as displayed: what was seen in th
 BARE_FRAME_COUNT = 50  # what the authors train on, and assumed where a file does not say
 BARE_FPS = 30.0
 
-SEGMENT_SUFFIXES = (".ply",)  # payloads that a segment may have
+SEGMENT_SUFFIXES = (".ply", ".stgc")  # payloads that a segment may have
 _SUFFIX_WORDS = " or ".join(SEGMENT_SUFFIXES)
-_ENDINGS = ".reel, .ply or .splatv"
+_ENDINGS = ".reel, .ply, .stgc or .splatv"
 
 Triple = tuple[float, float, float]
 Bounds = tuple[Triple, Triple]
@@ -113,8 +113,8 @@ class Reel:
 class Loaded:
     """Spacetime Gaussians with what is needed to play them, whatever file they came from.
 
-    `kind` is `reel`, `ply` or `splatv`; `report` says in sentences what was assumed and what is unusual. Frame j
-    of `frame_count`, counted from `frame_start`, has the normalized time j / frame_count. A full model is drawn with
+    `kind` is `reel`, `ply`, `stgc` or `splatv`; `report` says in sentences what was assumed and what is unusual. Frame
+    j of `frame_count`, counted from `frame_start`, has the normalized time j / frame_count. A full model is drawn with
     its `decoder`; where there is none, its base color stands for the color. `viewpoint` is as in `Reel`.
     """
 
@@ -138,7 +138,7 @@ class Loaded:
 
 
 def load_gaussians(path: str | Path, segment: int = 0, decoder_output: Activation | None = None) -> Loaded:
-    """Load a `.reel` (its `segment`-th payload), or a bare `.ply` or `.splatv`.
+    """Load a `.reel` (its `segment`-th payload), or a bare `.ply`, `.stgc` or `.splatv`.
 
     `decoder_output` is the activation of a bare full model whose `.pt` beside it does not say it (None: sigmoid).
     Raises `HoloreelError` for a missing, damaged or unknown file.
@@ -234,8 +234,8 @@ def write_segments(
     """Write a reel of one or more segments, all lite, or all full with decoders of one activation (or none with any).
 
     First the payloads, `NAME.ply` or, of several, `NAME.000.ply` and so on, and the decoders beside them; then the
-    manifest `NAME.reel` at `path`. Raises `HoloreelError` naming what does not
-    hold together.
+    manifest `NAME.reel` at `path`. `suffix` `.stgc` writes compact payloads. Raises `HoloreelError` naming what does
+    not hold together.
     """
     path = Path(path)
     stems = [path.stem] if len(payloads) == 1 else [f"{path.stem}.{index:03d}" for index in range(len(payloads))]

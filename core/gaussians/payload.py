@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from ..errors import HoloreelError
+from .compact import read_compact, write_compact
 from .decoder import Activation, Decoder, decoder_path, read_decoder, read_pt
 from .model import SpacetimeGaussians
 from .ply import read_ply, write_ply
@@ -21,6 +22,7 @@ class Payload(NamedTuple):
 
 PAYLOADS: dict[str, Payload] = {
     ".ply": Payload(read_ply, write_ply),
+    ".stgc": Payload(read_compact, write_compact),
     ".splatv": Payload(read_splatv, None),
 }
 
@@ -31,7 +33,7 @@ def read_payload(path: Path) -> tuple[SpacetimeGaussians, list[str]]:
 
 
 def write_payload(path: Path, gaussians: SpacetimeGaussians) -> None:
-    """Write the Gaussians of one segment, atomically; `path` ends in `.ply`."""
+    """Write the Gaussians of one segment, atomically; `path` ends in `.ply` or `.stgc`."""
     write = PAYLOADS[path.suffix.lower()].write
     if write is None:
         raise ValueError(f"{path} is no payload of a reel")
