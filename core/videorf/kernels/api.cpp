@@ -54,7 +54,7 @@ void sort_by_shard(const Volume& volume, Chunk& chunk) {
     uint32_t next[kShards + 1] = {};
     const auto each = [&](auto&& visit) {
         for (uint32_t i = 0; i < chunk.records.size(); i++)
-            for (uint32_t mask = volume.shards[chunk.records[i].cell]; mask; mask &= mask - 1)
+            for (uint32_t mask = volume.shards[chunk.records[i].corner / kBrickVertices]; mask; mask &= mask - 1)
                 visit(__builtin_ctz(mask), i);
     };
     each([&](int shard, uint32_t) { next[shard + 1]++; });
@@ -102,7 +102,7 @@ VIDEORF_API Volume* videorf_volume_new(const VideorfLattice* lattice) {
 }
 
 VIDEORF_API void videorf_volume_free(Volume* volume) { delete volume; }
-VIDEORF_API int64_t videorf_volume_cells(const Volume* volume) { return static_cast<int64_t>(volume->shards.size()); }
+VIDEORF_API int64_t videorf_volume_cells(const Volume* volume) { return volume->occupied_cells(); }
 
 // `samples` takes how many samples were taken.
 VIDEORF_API int videorf_forward(const Volume* volume, const float* table, int32_t channels, const VideorfRays* rays,

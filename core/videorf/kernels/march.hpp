@@ -14,7 +14,7 @@ constexpr int kBatch = 8;  // samples that are taken at once
 
 // What the backward pass leaves of a sample until the table's gradient is filled.
 struct Record {
-    int32_t cell;
+    int32_t corner;      // the cell's lowest in Volume::rows_of
     float x, y, z;       // place in the cell
     float weight;        // times the gradient of the ray's features gives that of the sample's features
     float density;       // the gradient of the sample's density

@@ -39,7 +39,7 @@ template <int C> HOLOREEL_INLINE float sum_row(typename RowOf<C>::type row) {
 // Up to kBatch samples, those in occupied cells only.
 struct Batch {
     int count;
-    alignas(32) int32_t cell[kBatch];
+    alignas(32) int32_t corner[kBatch];  // of the cell, its lowest, in Volume::rows_of
     alignas(32) float x[kBatch], y[kBatch], z[kBatch], t[kBatch];  // t: from the entry into the lattice, in spacings
     alignas(32) float density[kBatch], alpha[kBatch], passed[kBatch], slope[kBatch];
 };
@@ -117,9 +117,9 @@ private:
 
     HOLOREEL_INLINE_MEMBER void collect(Batch& batch) {
         alignas(32) float x[kBatch], y[kBatch], z[kBatch], t[kBatch];
-        alignas(32) int32_t cell[kBatch];
+        alignas(32) int32_t corner[kBatch], inside[kBatch], brick[kBatch];
         const int32_t* bricks = volume_.brick_of.data();
-        const int32_t* cells = volume_.cell_of.data();
+        const uint64_t* occupied = volume_.occupied.data();
         const int limit_x = volume_.cells[0] - 1, limit_y = volume_.cells[1] - 1, limit_z = volume_.cells[2] - 1;
         const int stride_x = volume_.bricks[1] * volume_.bricks[2], stride_y = volume_.bricks[2];
         for (int i = 0; i < kBatch; i++) {
@@ -133,18 +133,20 @@ private:
             x[i] = px - static_cast<float>(ix);
             y[i] = py - static_cast<float>(iy);
             z[i] = pz - static_cast<float>(iz);
-            const int brick = bricks[(ix >> 2) * stride_x + (iy >> 2) * stride_y + (iz >> 2)];
-            cell[i] = cells[brick + ((ix & 3) << 4 | (iy & 3) << 2 | (iz & 3))];
+            const int dx = ix & 3, dy = iy & 3, dz = iz & 3;
+            brick[i] = bricks[(ix >> 2) * stride_x + (iy >> 2) * stride_y + (iz >> 2)];
+            inside[i] = dx << 4 | dy << 2 | dz;
+            corner[i] = brick[i] * kBrickVertices + dx * kStrideX + dy * kStrideY + dz;
         }
         const int left = std::min(samples_ - next_, kBatch);
         int n = 0;
         for (int i = 0; i < left; i++) {
-            batch.cell[n] = cell[i];
+            batch.corner[n] = corner[i];
             batch.x[n] = x[i];
             batch.y[n] = y[i];
             batch.z[n] = z[i];
             batch.t[n] = t[i];
-            n += cell[i] >= 0;
+            n += occupied[brick[i]] >> inside[i] & 1;
         }
         batch.count = n;
         next_ += kBatch;
@@ -157,15 +159,14 @@ private:
 };
 
 template <int C>
-HOLOREEL_INLINE typename RowOf<C>::type interpolate(const float* table, const int32_t* corner, float x, float y, float z) {
+HOLOREEL_INLINE typename RowOf<C>::type interpolate(const float* table, const int32_t* rows, float x, float y, float z) {
     using Row = typename RowOf<C>::type;
-    const auto row = [&](int i) { return load_row<C>(table + size_t(corner[i]) * C); };
-    const auto along = [&](int i) -> Row {
-        const Row a = row(i);
-        return a + (row(i + 1) - a) * z;
+    const auto along = [&](int offset) -> Row {
+        const Row a = load_row<C>(table + size_t(rows[offset]) * C);
+        return a + (load_row<C>(table + size_t(rows[offset + 1]) * C) - a) * z;
     };
-    const Row a = along(0), b = along(4);
-    const Row near = a + (along(2) - a) * y, far = b + (along(6) - b) * y;
+    const Row a = along(0), b = along(kStrideX);
+    const Row near = a + (along(kStrideY) - a) * y, far = b + (along(kStrideX + kStrideY) - b) * y;
     return near + (far - near) * x;
 }
 
@@ -194,9 +195,9 @@ template <bool kSlope> HOLOREEL_INLINE void activate(Batch& batch, float step) {
 
 template <int C, bool kSlope, class Rows>
 HOLOREEL_INLINE void sample(const March& march, Batch& batch, Rows& rows) {
-    const int32_t* corners = march.volume->corners.data();
+    const int32_t* corners = march.volume->rows_of.data();
     for (int i = 0; i < batch.count; i++)
-        rows[i] = interpolate<C>(march.table, corners + 8 * size_t(batch.cell[i]), batch.x[i], batch.y[i], batch.z[i]);
+        rows[i] = interpolate<C>(march.table, corners + batch.corner[i], batch.x[i], batch.y[i], batch.z[i]);
     for (int i = 0; i < kBatch; i++) batch.density[i] = i < batch.count ? rows[i][0] : 0.0f;
     activate<kSlope>(batch, static_cast<float>(march.rays.step));
 }
@@ -265,7 +266,7 @@ template <int C> void backward_rays(const March& march, int64_t first, int64_t l
                 const float seen = sum_row<C>(rows[i] * incoming) + d_distance * (entry + batch.t[i]);
                 steps.push_back({weight, left, seen, batch.slope[i]});
                 chunk.records.push_back(
-                    {batch.cell[i], batch.x[i], batch.y[i], batch.z[i], weight, 0, static_cast<int32_t>(ray)});
+                    {batch.corner[i], batch.x[i], batch.y[i], batch.z[i], weight, 0, static_cast<int32_t>(ray)});
             }
         }
         // A denser sample takes light from all behind it, and from the background.
@@ -292,11 +293,12 @@ template <int C> void scatter_shard(const March& march, int shard, const Chunk* 
             if (march.gradients.accumulated)
                 row = load_row<C>(march.gradients.accumulated + size_t(record.ray) * C) * record.weight;
             row[0] = record.density;
-            const int32_t* corner = volume.corners.data() + 8 * size_t(record.cell);
+            const int32_t* rows = volume.rows_of.data() + record.corner;
             const float wx[2] = {1 - record.x, record.x}, wy[2] = {1 - record.y, record.y};
             const float wz[2] = {1 - record.z, record.z};
             for (int k = 0; k < 8; k++) {
-                float* target = corner[k] >= from && corner[k] < to ? gradient + size_t(corner[k]) * C : elsewhere;
+                const int r = rows[(k >> 2) * kStrideX + (k >> 1 & 1) * kStrideY + (k & 1)];
+                float* target = r >= from && r < to ? gradient + size_t(r) * C : elsewhere;
                 store_row<C>(target, load_row<C>(target) + row * (wx[k >> 2] * wy[k >> 1 & 1] * wz[k & 1]));
             }
         }

@@ -37,43 +37,52 @@ Volume::Volume(const VideorfLattice& lattice) {
     }
     brick_of.assign(size_t(bricks[0]) * bricks[1] * bricks[2], 0);
     block_full.assign(size_t(blocks[0]) * blocks[1] * blocks[2], 0);
-    constexpr int kCells = kBrick * kBrick * kBrick;
-    cell_of.assign(kCells, -1);  // the empty brick
-    const int64_t step_y = lattice.shape[2], step_x = step_y * lattice.shape[1];
+    occupied.assign(1, 0);
+    rows_of.assign(kBrickVertices, rows - 1);
+    shards.assign(1, 0);
     size_t brick = 0;
     for (int bx = 0; bx < bricks[0]; bx++)
-    for (int by = 0; by < bricks[1]; by++)
-    for (int bz = 0; bz < bricks[2]; bz++, brick++) {
-        int32_t found[kCells];
-        bool full = false;
-        for (int inside = 0; inside < kCells; inside++) {
-            const int x = bx * kBrick + inside / 16, y = by * kBrick + inside / 4 % 4, z = bz * kBrick + inside % 4;
-            found[inside] = -1;
-            if (x >= cells[0] || y >= cells[1] || z >= cells[2]) continue;
-            const int32_t* vertex = lattice.lookup + x * step_x + y * step_y + z;
-            int32_t row[8];
-            bool occupied = false;
-            for (int corner = 0; corner < 8; corner++) {
-                row[corner] = vertex[(corner >> 2) * step_x + (corner >> 1 & 1) * step_y + (corner & 1)];
-                occupied |= row[corner] >= 0;
+        for (int by = 0; by < bricks[1]; by++)
+            for (int bz = 0; bz < bricks[2]; bz++, brick++) {
+                if (!add_brick(lattice, bx * kBrick, by * kBrick, bz * kBrick)) continue;
+                brick_of[brick] = static_cast<int32_t>(occupied.size()) - 1;
+                constexpr int kRatio = kBlock / kBrick;
+                block_full[(size_t(bx / kRatio) * blocks[1] + by / kRatio) * blocks[2] + bz / kRatio] = 1;
             }
-            if (!occupied) continue;
-            uint32_t mask = 0;
-            for (int32_t& r : row) {
-                if (r >= 0) mask |= 1u << (r / shard_rows);
-                else r = rows - 1;
-            }
-            found[inside] = static_cast<int32_t>(shards.size());
-            corners.insert(corners.end(), row, row + 8);
-            shards.push_back(mask);
-            full = true;
+}
+
+bool Volume::add_brick(const VideorfLattice& lattice, int x0, int y0, int z0) {
+    const int64_t step_y = lattice.shape[2], step_x = step_y * lattice.shape[1];
+    int32_t found[kBrickVertices];
+    uint64_t full = 0;
+    uint32_t mask = 0;
+    for (int i = 0; i < kBrickVertices; i++) {
+        const int dx = i / kStrideX, dy = i / kStrideY % kStrideY, dz = i % kStrideY;
+        const int x = x0 + dx, y = y0 + dy, z = z0 + dz;
+        found[i] = rows - 1;
+        if (x >= lattice.shape[0] || y >= lattice.shape[1] || z >= lattice.shape[2]) continue;
+        const int32_t row = lattice.lookup[x * step_x + y * step_y + z];
+        if (row < 0) continue;
+        found[i] = row;
+        mask |= 1u << (row / shard_rows);
+        for (int corner = 0; corner < 8; corner++) {  // the cells it is a corner of
+            const int cx = dx - (corner >> 2), cy = dy - (corner >> 1 & 1), cz = dz - (corner & 1);
+            if (cx < 0 || cy < 0 || cz < 0 || cx >= kBrick || cy >= kBrick || cz >= kBrick) continue;
+            if (x0 + cx >= cells[0] || y0 + cy >= cells[1] || z0 + cz >= cells[2]) continue;
+            full |= uint64_t(1) << (16 * cx + 4 * cy + cz);
         }
-        if (!full) continue;
-        brick_of[brick] = static_cast<int32_t>(cell_of.size());
-        cell_of.insert(cell_of.end(), found, found + kCells);
-        constexpr int kRatio = kBlock / kBrick;
-        block_full[(size_t(bx / kRatio) * blocks[1] + by / kRatio) * blocks[2] + bz / kRatio] = 1;
     }
+    if (!full) return false;
+    occupied.push_back(full);
+    rows_of.insert(rows_of.end(), found, found + kBrickVertices);
+    shards.push_back(mask);
+    return true;
+}
+
+int64_t Volume::occupied_cells() const {
+    int64_t sum = 0;
+    for (uint64_t mask : occupied) sum += __builtin_popcountll(mask);
+    return sum;
 }
 
 }  // namespace videorf
