@@ -112,6 +112,13 @@ def read_capture(path: str | Path, options: CaptureOptions | None = None, **chan
 
 def find_layout(path: Path, options: CaptureOptions) -> str:
     """Return the name of the layout of what lies at `path`; raises `HoloreelError` where it is none."""
+    try:
+        return _find_layout(path, options)
+    except OSError as error:
+        raise HoloreelError(f"{path} cannot be read ({error.strerror or error}): check the path.") from error
+
+
+def _find_layout(path: Path, options: CaptureOptions) -> str:
     if options.layout != "auto":
         if options.layout not in LAYOUTS:
             raise HoloreelError(f"--layout {options.layout}: no such layout; take one of auto, {', '.join(LAYOUTS)}.")

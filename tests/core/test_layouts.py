@@ -354,6 +354,8 @@ def test_every_layout_is_found_and_named(small: Capture, tmp_path: Path) -> None
         read_capture(tmp_path)
     with pytest.raises(HoloreelError, match=r"holds 1 .txt, no technicolor capture \(SCENE_undist"):
         read_capture(tmp_path, layout="technicolor")
+    with pytest.raises(HoloreelError, match="cannot be read"):
+        read_capture(tmp_path / ("a" * 400))
     with pytest.raises(HoloreelError, match="no such layout"):
         read_capture(tmp_path, layout="llff")
     assert CaptureOptions().layout == "auto"
