@@ -140,7 +140,6 @@ class _Watched:
         "picture_loss": "loss",
         "l1_dssim": "loss",
         "adam": "Adam",
-        "adam_step": "Adam",
     }
 
     def __init__(self, backend: ModuleType) -> None:

@@ -3,10 +3,12 @@
 
 import ctypes
 import math
+import weakref
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
@@ -38,7 +40,6 @@ DEVICE = "cpu"
 __all__ = [
     "DEVICE",
     "adam",
-    "adam_step",
     "decode",
     "get_threads",
     "l1_dssim",
@@ -131,6 +132,41 @@ class _Frame:
         return self.library.holoreel_frame_intersections(self.handle)
 
 
+class _Memory:
+    """Memory of large tensors that nobody holds any more, for the next ones: fresh pages are dear."""
+
+    SMALL, LIMIT = 1 << 14, 1 << 28  # bytes of one that is not worth it, and of all that may wait here
+
+    def __init__(self) -> None:
+        self.spare: dict[int, list[np.ndarray]] = {}
+        self.bytes = 0
+
+    def empty(self, *shape: int) -> Tensor:
+        """Return a float32 tensor of any contents."""
+        size = math.prod(shape)
+        if 4 * size < self.SMALL:
+            return torch.empty(shape)
+        waiting = self.spare.get(size)
+        if waiting:
+            memory = waiting.pop()
+            self.bytes -= memory.nbytes
+        else:
+            memory = np.empty(size, np.float32)
+        view = memory.view()  # which the tensor holds, so its end is the tensor's
+        weakref.finalize(view, self._give_back, memory).atexit = False
+        return torch.from_numpy(view).reshape(shape)
+
+    def _give_back(self, memory: np.ndarray) -> None:
+        if self.bytes + memory.nbytes > self.LIMIT:  # sizes have changed, or pictures are huge
+            self.spare, self.bytes = {}, 0
+        if memory.nbytes <= self.LIMIT:
+            self.spare.setdefault(memory.size, []).append(memory)
+            self.bytes += memory.nbytes
+
+
+_memory = _Memory()
+
+
 def _c_camera(camera: Camera) -> CCamera:
     pose = (ctypes.c_double * 12)(*camera.world_to_camera[:3].ravel().tolist())
     return CCamera(camera.fx, camera.fy, camera.cx, camera.cy, pose, camera.width, camera.height)
@@ -154,8 +190,8 @@ class _Rasterize(torch.autograd.Function):
     def forward(ctx: Any, job: _Job, background: Tensor | None, *arrays: Tensor | None) -> tuple[Tensor, ...]:
         channels = arrays[PARAMETERS.index("features")].shape[1]  # type: ignore[union-attr]
         height, width = job.camera.height, job.camera.width
-        pictures = (torch.empty(height, width, channels), torch.empty(height, width), torch.empty(height, width))
-        rest = torch.empty(height, width)
+        pictures = tuple(_memory.empty(height, width, *more) for more in ((channels,), (), ()))
+        rest = _memory.empty(height, width)
         images = CImages(*map(_address, (*pictures, rest, background)))
         library = load_kernels()
         handle = library.holoreel_forward(job.c_gaussians(arrays), _c_camera(job.camera), job.c_rules(), images)
@@ -173,7 +209,7 @@ class _Rasterize(torch.autograd.Function):
         background, features, alpha, depth, rest, *arrays = ctx.saved_tensors
         incoming = tuple(_plain(gradient) for gradient in picture_gradients)
         outgoing = tuple(
-            torch.empty_like(array) if array is not None and needed else None
+            _memory.empty(*array.shape) if array is not None and needed else None
             for array, needed in zip(arrays, ctx.needs_input_grad[2:], strict=True)
         )
         density = ctx.job.density
@@ -205,7 +241,7 @@ def decode(features: Tensor, camera: Camera, hidden: Tensor, output: Tensor, act
 class _Decode(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, features: Tensor, camera: Camera, hidden: Tensor, output: Tensor, activation: int) -> Tensor:
-        image = torch.empty(camera.height, camera.width, 3)
+        image = _memory.empty(camera.height, camera.width, 3)
         decoder = CDecoder(_address(hidden), _address(output), activation, 0)
         library = load_kernels()
         if library.holoreel_decode(_c_camera(camera), decoder, _address(features), _address(image)) != 0:
@@ -218,7 +254,7 @@ class _Decode(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
         features, hidden, output = ctx.saved_tensors
-        d_features = torch.empty_like(features) if ctx.needs_input_grad[0] else None
+        d_features = _memory.empty(*features.shape) if ctx.needs_input_grad[0] else None
         d_hidden, d_output = torch.empty_like(hidden), torch.empty_like(output)
         gradient = _plain(gradient)  # keeps it alive during the call
         library = load_kernels()
@@ -249,7 +285,7 @@ class _PictureLoss(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, image: Tensor, target: Tensor, weight: float) -> tuple[Tensor, float]:
         # The gradient comes almost for free with the value, so it is taken at once.
-        gradient = torch.empty_like(image) if ctx.needs_input_grad[0] else None
+        gradient = _memory.empty(*image.shape) if ctx.needs_input_grad[0] else None
         loss, squared_error = ctypes.c_double(), ctypes.c_double()
         library = load_kernels()
         targets = (None, _address(target)) if target.dtype == torch.uint8 else (_address(target), None)
@@ -288,18 +324,3 @@ def adam(groups: Sequence[AdamGroup], beta1: float, beta2: float, eps: float, st
         )
     )
     load_kernels().holoreel_adam_step(array, len(groups), beta1, beta2, eps, step)
-
-
-def adam_step(
-    param: Tensor,
-    grad: Tensor,
-    exp_avg: Tensor,
-    exp_avg_sq: Tensor,
-    lr: float,
-    beta1: float,
-    beta2: float,
-    eps: float,
-    step: int,
-) -> None:
-    """Take one step of Adam with one tensor."""
-    adam([AdamGroup(param, grad, exp_avg, exp_avg_sq, lr)], beta1, beta2, eps, step)

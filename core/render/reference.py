@@ -382,18 +382,3 @@ def adam(groups: Sequence[AdamGroup], beta1: float, beta2: float, eps: float, st
             if group.column_rates is not None:
                 move *= group.column_rates.reshape(value.shape[1:])
             value.sub_(move).clamp_(group.low, group.high)
-
-
-def adam_step(
-    param: Tensor,
-    grad: Tensor,
-    exp_avg: Tensor,
-    exp_avg_sq: Tensor,
-    lr: float,
-    beta1: float,
-    beta2: float,
-    eps: float,
-    step: int,
-) -> None:
-    """Take one step of Adam with one tensor."""
-    adam([AdamGroup(param, grad, exp_avg, exp_avg_sq, lr)], beta1, beta2, eps, step)

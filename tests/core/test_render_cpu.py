@@ -392,6 +392,25 @@ def test_without_temporal_culling_the_picture_is_the_same():
     assert visible[1] > 1.2 * visible[0]
 
 
+def test_memory_is_used_again_only_when_nobody_holds_it():
+    case = plain_case(3, 300, 96, 64)
+    with torch.no_grad():
+        held = cpu.rasterize_spacetime(case.gaussians, TIME, case.camera)
+        copies = [picture.clone() for picture in held]
+        row = held.features[3]  # a view alone keeps the memory too
+        places = {held.features.data_ptr()}
+        for time in (0.1, 0.2, 0.3):
+            other = cpu.rasterize_spacetime(case.gaussians, time, case.camera)
+            assert other.features.data_ptr() not in places
+        assert all(torch.equal(a, b) for a, b in zip(held, copies, strict=True))
+        del held
+        cpu.rasterize_spacetime(case.gaussians, 0.9, case.camera)
+        assert torch.equal(row, copies[0][3])
+        del row, other
+        again = [cpu.rasterize_spacetime(case.gaussians, time, case.camera).features.data_ptr() for time in (0.1, 0.2)]
+        assert again[0] == again[1]
+
+
 def test_no_gradient_no_graph():
     case = plain_case(3, 100, 32, 32)
     with torch.no_grad():
