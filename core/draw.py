@@ -48,8 +48,9 @@ def draw(
     With a `decoder`, `background` is ignored: it colors every pixel.
     """
     with torch.no_grad():
-        rendering = render_view(backend, gaussians, time, camera, torch.tensor(background), decoder, rules)
-    return Drawing(*(part.numpy() for part in rendering))
+        color = torch.tensor(background, device=backend.DEVICE)
+        rendering = render_view(backend, gaussians, time, camera, color, decoder, rules)
+    return Drawing(*(part.cpu().numpy() for part in rendering))
 
 
 def to_tensors(gaussians: SpacetimeGaussians, decoded: bool = False) -> SpacetimeTensors:
@@ -111,4 +112,5 @@ class Player:
     def _load(self, segment: int) -> tuple[SpacetimeTensors, DecoderTensors | None]:
         loaded = self.first if segment == 0 else load_gaussians(self.path, segment)
         decoder = decoder_tensors(loaded.decoder) if loaded.decoder else None
-        return to_tensors(loaded.gaussians, decoded=decoder is not None), decoder
+        tensors = to_tensors(loaded.gaussians, decoded=decoder is not None)
+        return SpacetimeTensors(*(tensor.to(self.backend.DEVICE) for tensor in tensors)), decoder

@@ -15,7 +15,8 @@ import numpy as np
 import torch
 
 from ..camera import Camera
-from ..capture import Capture
+from ..capture import Capture, View
+from ..capture.media import Media
 from ..gaussians.config import PRESETS
 from ..gaussians.model import SpacetimeGaussians
 from ..gaussians.train import Trainer
@@ -101,7 +102,8 @@ def synthetic_capture(
 ) -> tuple[Capture, SpacetimeGaussians]:
     """Draw a random scene from a few cameras at a few times; return the capture and Gaussians near the true ones."""
     truth, camera = random_scene(setup.gaussians, setup.width, setup.height, 3)
-    cameras, images = {}, {}
+    cameras: dict[str, Camera] = {}
+    images: dict[View, Media] = {}
     for view in range(VIEWS):
         pose = np.eye(4)
         pose[0, 3] = 0.1 * (view - (VIEWS - 1) / 2)
@@ -112,8 +114,9 @@ def synthetic_capture(
         for frame in range(FRAMES):
             with torch.no_grad():
                 picture = backend.rasterize_spacetime(truth, frame / FRAMES, cameras[name]).features
-            images[name, frame] = folder / f"{name}_{frame}.png"
-            write_png(images[name, frame], picture.cpu().numpy())
+            path = folder / f"{name}_{frame}.png"
+            write_png(path, picture.cpu().numpy())
+            images[name, frame] = path
     random = np.random.default_rng(1)
     arrays = {name: value.numpy() for name, value in zip(SpacetimeTensors._fields, truth, strict=True)}
     arrays["features"] = random.uniform(0, 1, (setup.gaussians, columns)).astype(np.float32)

@@ -5,6 +5,7 @@ import importlib.metadata
 import json
 import platform
 import re
+import shutil
 import subprocess
 import sys
 from collections.abc import Callable
@@ -17,7 +18,10 @@ import tyro
 from ..blender import Blender, find_blender
 from ..errors import HoloreelError
 
-DEPENDENCIES = ("numpy", "torch", "imageio", "OpenEXR", "scikit-image", "matplotlib", "jinja2")
+DEPENDENCIES = (
+    *("numpy", "torch", "imageio", "OpenEXR", "scikit-image", "matplotlib", "jinja2"),
+    *("av", "pycolmap", "safetensors", "scipy", "pillow"),
+)
 OLDEST_BLENDER = (4, 5)
 _PATIENCE_SECONDS = 120
 _LANES = {8: "8 lanes (AVX2 and FMA)", 4: "4 lanes (SSE4.1 or NEON)"}
@@ -40,7 +44,7 @@ def run(blender: Path | None = None, as_json: Annotated[bool, tyro.conf.arg(name
         blender: the Blender to look at; without it, the one that `holoreel synth` would find.
         as_json: print JSON for programs to read.
     """
-    findings = [*dependencies(), kernels(), find(blender)]
+    findings = [*dependencies(), kernels(), gpu(), find(blender)]
     if as_json:
         print(json.dumps([asdict(finding) for finding in findings], indent=1))
         return
@@ -73,6 +77,34 @@ def kernels() -> Finding:
         return f"{lanes}, {used} threads on {cores} cores (HOLOREEL_THREADS changes that)"
 
     return _judge("kernels", look, " Until then everything runs on plain torch, about 50 times slower.")
+
+
+def gpu() -> Finding:
+    """Look at what the `cuda` backend needs: a torch for CUDA that sees a GPU, gsplat, and the compiler it needs.
+
+    gsplat is not loaded: that may compile for minutes.
+    """
+
+    def look() -> str:
+        import torch
+
+        if torch.version.cuda is None:
+            raise HoloreelError(
+                "torch is a build for the CPU: for --backend cuda take one for CUDA from https://pytorch.org."
+            )
+        if not torch.cuda.is_available():
+            raise HoloreelError("torch sees no NVIDIA GPU: for --backend cuda install one and its driver.")
+        try:
+            version = importlib.metadata.version("gsplat")
+        except importlib.metadata.PackageNotFoundError as error:
+            raise HoloreelError("gsplat is not installed: pip install -e '.[cuda]'.") from error
+        if shutil.which("nvcc") is None:
+            raise HoloreelError(
+                f"nvcc is not on the PATH: gsplat compiles its kernels with it; install CUDA {torch.version.cuda}."
+            )
+        return f"{torch.cuda.get_device_name()}, CUDA {torch.version.cuda}, gsplat {version}"
+
+    return _judge("GPU", look, " Until then the CPU is used; nothing else is missing.")
 
 
 def find(path: Path | None) -> Finding:

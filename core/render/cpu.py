@@ -256,12 +256,12 @@ class _Decode(torch.autograd.Function):
         features, hidden, output = ctx.saved_tensors
         d_features = _memory.empty(*features.shape) if ctx.needs_input_grad[0] else None
         d_hidden, d_output = torch.empty_like(hidden), torch.empty_like(output)
-        gradient = _plain(gradient)  # keeps it alive during the call
+        incoming = _plain(gradient)  # keeps it alive during the call
         library = load_kernels()
         status = library.holoreel_decode_backward(
             _c_camera(ctx.camera),
             CDecoder(_address(hidden), _address(output), ctx.activation, 0),
-            *map(_address, (features, gradient, d_features, d_hidden, d_output)),
+            *map(_address, (features, incoming, d_features, d_hidden, d_output)),
         )
         if status != 0:
             raise HoloreelError(f"The gradient cannot be computed: {library.holoreel_last_error().decode()}.")
@@ -271,8 +271,8 @@ class _Decode(torch.autograd.Function):
 def picture_loss(image: Tensor, target: Tensor, weight_dssim: float) -> PictureLoss:
     """Return the training loss and the mean squared error of two images, as in `contract`, in float32."""
     check_images(image, target)
-    target = target.contiguous() if target.dtype == torch.uint8 else _plain(target)
-    loss, squared_error = _PictureLoss.apply(_plain(image), target, float(weight_dssim))
+    plain = target.contiguous() if target.dtype == torch.uint8 else _plain(target)
+    loss, squared_error = _PictureLoss.apply(_plain(image), plain, float(weight_dssim))
     return PictureLoss(loss, squared_error)
 
 

@@ -18,7 +18,7 @@ from torch import Tensor
 
 from ..camera import Camera
 from ..errors import HoloreelError
-from . import reference
+from . import cpu, reference
 from .checks import check_decoder, check_gaussians, check_pinhole, check_spacetime
 from .contract import AdamGroup, DensityStats, PictureLoss, Rendering, Rules, SpacetimeTensors
 from .reference import Gaussians3D
@@ -96,11 +96,14 @@ def l1_dssim(image: Tensor, target: Tensor, weight_dssim: float) -> Tensor:
 
 
 def adam(groups: Sequence[AdamGroup], beta1: float, beta2: float, eps: float, step: int) -> None:
-    """Take one step of Adam, in place, as in `contract`, wherever the tensors lie.
+    """Take one step of Adam, in place, as in `contract`: on the GPU, or by the CPU's kernels what lies there.
 
     gsplat's SelectiveAdam, which steps only what a picture saw, has no bias correction and so is another optimizer.
     """
-    reference.adam(groups, beta1, beta2, eps, step)
+    here = [group for group in groups if group.value.device.type == "cpu"]
+    if here:
+        cpu.adam(here, beta1, beta2, eps, step)
+    reference.adam([group for group in groups if group.value.device.type != "cpu"], beta1, beta2, eps, step)
 
 
 def _there(tensor: Tensor) -> Tensor:

@@ -61,7 +61,7 @@ def render_view(
     seen = alpha > 0.0
     depth = torch.where(seen, weighted / torch.where(seen, alpha, 1.0), 0.0)
     if background is not None:
-        color = color + (1.0 - alpha)[..., None] * background
+        color = color + (1.0 - alpha)[..., None] * background.to(color.device)
     return Rendering(color, alpha, depth)
 
 

@@ -5,7 +5,9 @@ The backends that run on a GPU are skipped by name where there is none.
 """
 
 import math
+import sys
 from dataclasses import replace
+from types import SimpleNamespace
 from typing import NamedTuple
 
 import pytest
@@ -28,10 +30,9 @@ class Promise(NamedTuple):
     gradient: float  # relative, L2
 
 
-PROMISES = {
-    "cpu": Promise(Rules(), 0.01, 2e-6, 2e-4),
-    "cuda": Promise(Rules(alpha_max=0.999), 0.01, 1e-4, 2e-2),
-}
+GSPLAT = Promise(Rules(alpha_max=0.999), 0.01, 1e-4, 2e-2)
+STAND_IN = "cuda with a stand-in for gsplat"
+PROMISES = {"cpu": Promise(Rules(), 0.01, 2e-6, 2e-4), "cuda": GSPLAT, STAND_IN: GSPLAT}
 
 
 def plain(channels):
@@ -87,9 +88,54 @@ CARDS = {
 }
 
 
+def stand_in(
+    *,
+    means,
+    quats,
+    scales,
+    opacities,
+    colors,
+    viewmats,
+    Ks,
+    width,
+    height,
+    near_plane,
+    eps2d,
+    backgrounds,
+    render_mode,
+    packed,
+):
+    """What gsplat's `rasterization` returns for these arguments, made of the oracle's parts."""
+    assert (render_mode, packed) == ("RGB+ED", False)
+    (fx, _, cx), (_, fy, cy), _ = Ks[0].tolist()
+    camera = Camera(width, height, fx, fy, cx, cy, viewmats[0].double().numpy())
+    rules = replace(GSPLAT.rules, near=near_plane, low_pass=eps2d)
+    count = len(means)
+    gaussians = reference.Gaussians3D(means, quats, scales, opacities, colors)
+    splats = reference.project(gaussians, torch.arange(count), camera, rules)
+    places = torch.zeros(1, count, 2).index_put((torch.zeros_like(splats.rows), splats.rows), splats.means)
+    splats = splats._replace(means=places[0, splats.rows])
+    sums = reference.composite(splats, width, height, rules)
+    alpha = sums[..., -1:]
+    features = sums[..., :-2] + (1 - alpha) * (0 if backgrounds is None else backgrounds[0])
+    radii, conics = torch.zeros(1, count, 2, dtype=torch.int32), torch.zeros(1, count, 3)
+    _, lists = reference.bin_to_tiles(splats, width, height, rules)
+    radii[0, splats.rows[lists]] = 1
+    conics[0, splats.rows] = splats.conics.detach()
+    depth = sums[..., -2:-1] / alpha.clamp(min=1e-10)
+    picture = torch.cat((features, depth), 2)[None]
+    return picture, alpha[None], {"means2d": places, "radii": radii, "conics": conics}
+
+
 @pytest.fixture(params=sorted(PROMISES))
-def backend(request):
+def backend(request, monkeypatch):
     """Yield (backend, its promise)."""
+    if request.param == STAND_IN:
+        from holoreel.core.render import cuda
+
+        monkeypatch.setattr(cuda, "DEVICE", "cpu")
+        monkeypatch.setitem(sys.modules, "gsplat", SimpleNamespace(rasterization=stand_in))
+        return cuda, PROMISES[request.param]
     try:
         return get_backend(request.param), PROMISES[request.param]
     except HoloreelError as error:
