@@ -7,7 +7,7 @@ one of them (which also finds a camera that is turned along its epipolar lines).
 its calibration says spoils every pair and triple it is part of, and no other: it is named.
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 
@@ -18,7 +18,7 @@ from ..camera import Camera
 from ..errors import HoloreelError
 from .jobs import Found
 
-Members = tuple[int, ...]
+Members = tuple[int, int] | tuple[int, int, int]
 Array = NDArray[np.float64]
 
 MIN_PIXELS = 1.5
@@ -67,9 +67,9 @@ class CalibrationCheck:
         for (a, b), matches in found.matches.items():
             self._matches[[a, b]] += len(matches)
             self._put((a, b), self._pair(a, b, rays[a][matches[:, 0]], rays[b][matches[:, 1]]))
-        tracks = _tracks(found, len(self._cameras))
-        for triple in _triples(tracks):
-            rows = tracks[(tracks[:, triple] >= 0).all(axis=1)][:, triple]
+        partners = {pair: _partners(matches, len(rays[pair[0]])) for pair, matches in found.matches.items()}
+        for triple in _triples(partners, len(self._cameras)):
+            rows = _seen_by_three(triple, partners)
             rows = rows[:: max(len(rows) // _MAX_SAMPLE, 1)]
             if len(rows):
                 self._put(triple, self._triple(triple, [rays[c][rows[:, k]] for k, c in enumerate(triple)]))
@@ -77,11 +77,11 @@ class CalibrationCheck:
     def judge(self) -> list[CameraCheck]:
         """Return what the matches so far say about each camera, in order."""
         tests = {members: np.concatenate(parts) for members, parts in self._residuals.items()}
-        medians = {
-            members: float(np.median(values)) for members, values in tests.items() if len(values) >= _MIN_MATCHES
-        }
+        tests = {members: values for members, values in tests.items() if len(values) >= _MIN_MATCHES}
+        medians = {members: float(np.median(values)) for members, values in tests.items()}
         limit = self._limit(medians)
-        wrong = _contradictions(medians, limit, len(self._cameras))
+        suspects = _contradictions(medians, limit, len(self._cameras))
+        wrong = {index for index in suspects if self._evident(index, tests, limit)}
         checks = []
         for index, camera in enumerate(self._cameras):
             others = [set(members) - {index} for members in medians]
@@ -223,34 +223,31 @@ def _blame(index: int, tests: dict[Members, float], limit: float) -> tuple[float
     return round(max(shares), 6), round(sum(shares), 6), float(np.median(values)) if values else 0.0
 
 
-def _tracks(found: Found, count: int) -> NDArray[np.int64]:
-    """Chain matches into tracks: (T, C) keypoint index per camera, -1 where there is none; at least three of them.
-
-    Tracks with two keypoints of one camera are left out.
-    """
-    from scipy.sparse import coo_matrix
-    from scipy.sparse.csgraph import connected_components
-
-    starts = np.cumsum([0, *(len(points) for points in found.keypoints)])
-    links = [matches + starts[list(pair)] for pair, matches in found.matches.items()]
-    if not links:
-        return np.empty((0, count), np.int64)
-    link = np.concatenate(links)
-    graph = coo_matrix((np.ones(len(link), np.int8), (link[:, 0], link[:, 1])), shape=(starts[-1], starts[-1]))
-    labels = connected_components(graph, directed=False)[1]
-    nodes = np.unique(link)
-    camera = np.searchsorted(starts, nodes, side="right") - 1
-    track = np.unique(labels[nodes], return_inverse=True)[1]
-    table = np.full((track.max() + 1, count), -1, np.int64)
-    table[track, camera] = nodes - starts[camera]
-    used = np.bincount(track)
-    return table[(used == (table >= 0).sum(axis=1)) & (used >= 3)]
+def _partners(matches: NDArray[np.int64], count: int) -> NDArray[np.int64]:
+    """The keypoint that each of `count` keypoints is matched with, -1 where there is none."""
+    partners = np.full(count, -1, np.int64)
+    partners[matches[:, 0]] = matches[:, 1]
+    return partners
 
 
-def _triples(tracks: NDArray[np.int64]) -> list[Members]:
-    """All triples of cameras, or as many of them as there is time for."""
-    triples = list(combinations(range(tracks.shape[1]), 3))
+def _triples(partners: Mapping[tuple[int, int], NDArray[np.int64]], count: int) -> list[Members]:
+    """The triples of cameras that are matched with each other, or as many of them as there is time for."""
+    triples = [
+        (a, b, c)
+        for a, b, c in combinations(range(count), 3)
+        if (a, b) in partners and (a, c) in partners and (b, c) in partners
+    ]
     if len(triples) <= _MAX_TRIPLES:
         return triples
     chosen = np.random.default_rng(0).choice(len(triples), _MAX_TRIPLES, replace=False)
     return [triples[index] for index in np.sort(chosen)]
+
+
+def _seen_by_three(
+    triple: tuple[int, int, int], partners: Mapping[tuple[int, int], NDArray[np.int64]]
+) -> NDArray[np.int64]:
+    """Keypoints (N, 3) of which each is matched with both others: three matches that agree are hardly wrong."""
+    a, b, c = triple
+    rows = np.flatnonzero((partners[a, b] >= 0) & (partners[a, c] >= 0))
+    rows = rows[partners[b, c][partners[a, b][rows]] == partners[a, c][rows]]
+    return np.stack([rows, partners[a, b][rows], partners[a, c][rows]], axis=1)

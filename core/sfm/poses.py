@@ -40,7 +40,7 @@ OnMessage = Callable[[str], None]
 
 TYPICAL_DISTANCE = 5.0
 _FOCAL_GUESS = 0.9  # of the longer side: 58 degrees
-_LEVEL_WEIGHT = 0.1  # how much the cameras' vertical axes count against their horizontal ones
+_LEVEL_WEIGHT = 0.01  # how much the cameras' vertical axes count against their horizontal ones
 _PARAMETERS = {"SIMPLE_RADIAL": 4, "PINHOLE": 4, "OPENCV": 8, "OPENCV_FISHEYE": 8, "FULL_OPENCV": 12}
 
 
