@@ -85,6 +85,11 @@ def probe(path: str | Path) -> VideoFacts:
     return _index_of(Path(path)).facts
 
 
+def keyframes(path: str | Path) -> tuple[int, ...]:
+    """The numbers of the frames that reading can start at without decoding others; none where nobody knows."""
+    return _index_of(Path(path)).keys
+
+
 def read_frame(frame: VideoFrame) -> NDArray[np.uint8]:
     """Read one frame as (H, W, 3); nearby and following frames of a few videos are quick to read next."""
     with _pool_lock:

@@ -5,6 +5,10 @@ Format: https://docs.nerf.studio/quickstart/data_conventions.html. Camera-to-wor
 y up, looking along -z). Every frame entry has a `time` in [0, 1), as D-NeRF's. What nerfstudio has no word for lies in
 objects named `holoreel`: at the top (version, fps, frame_start, frame_count, cameras, seeds) and in each entry (camera,
 frame). Files without them are read too: entries of one pose and lens are one camera, evenly spaced times are frames.
+
+Lenses are OpenCV's, as nerfstudio's: `camera_model` OPENCV has k1 k2 p1 p2 k3, and OPENCV_FISHEYE k1 k2 k3 k4; those
+that are missing are 0. FULL_OPENCV, which nerfstudio does not know, has k4 k5 k6 too. A picture may be a frame of a
+video: `file_path` then names the video, and `holoreel.video_frame` the frame, from 0.
 """
 
 import os
@@ -15,17 +19,22 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..camera import Camera, invert_rigid, rigid
+from ..camera import MODELS, Camera, invert_rigid, rigid
 from ..errors import HoloreelError
 from ..files import finite, read_json, write_json
 from .capture import MAX_FRAMES, Capture, View
+from .media import Media, VideoFrame, media_path
 
 FILE_NAME = "transforms.json"
 _VERSION = 1
 _MAX_ENTRIES = 2_000_000
 _OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])  # OpenCV camera axes in OpenGL's, and back
-_PERSPECTIVE = ("PINHOLE", "SIMPLE_PINHOLE", "OPENCV", "SIMPLE_RADIAL", "RADIAL")
-_DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
+_MODELS = {  # of nerfstudio's and COLMAP's names, those that mean one of ours, and its parameters
+    **dict.fromkeys(("PINHOLE", "SIMPLE_PINHOLE", "OPENCV", "SIMPLE_RADIAL", "RADIAL"), ("k1", "k2", "k3", "p1", "p2")),
+    "FULL_OPENCV": MODELS["FULL_OPENCV"].parameters,
+    "OPENCV_FISHEYE": MODELS["OPENCV_FISHEYE"].parameters,
+}
+_DISTORTION = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
 _LENS = {"width": "w", "height": "h", "fx": "fl_x", "fy": "fl_y", "cx": "cx", "cy": "cy"}
 
 
@@ -33,7 +42,7 @@ _LENS = {"width": "w", "height": "h", "fx": "fl_x", "fy": "fl_y", "cx": "cx", "c
 class _Entry:
     """One element of `frames`, understood."""
 
-    path: Path
+    media: Media
     listed: str  # file_path as written
     camera: Camera
     time: float | None
@@ -53,16 +62,19 @@ def write_capture(path: str | Path, capture: Capture) -> Path:
     entries = []
     files: dict[str, list[str]] = {"train": [], "test": []}
     for name, frame in capture.views():
-        entry: dict[str, Any] = {"file_path": _relative(capture.images[name, frame], path)}
+        media = capture.images[name, frame]
+        entry: dict[str, Any] = {"file_path": _relative(media_path(media), path)}
         entry |= {key: value for key, value in lenses[name].items() if key not in shared}
         entry["transform_matrix"] = (capture.cameras[name].camera_to_world @ _OPENGL).tolist()
         entry["time"] = capture.time(frame)
         if (name, frame) in capture.depths:
             entry["depth_file_path"] = _relative(capture.depths[name, frame], path)
         entry["holoreel"] = {"camera": name, "frame": frame}
+        if isinstance(media, VideoFrame):
+            entry["holoreel"]["video_frame"] = media.index
         entries.append(entry)
         files[capture.split(name)].append(entry["file_path"])
-    value: dict[str, Any] = {"camera_model": "OPENCV", **shared}
+    value: dict[str, Any] = dict(shared)
     if files["test"]:
         value |= {
             "train_filenames": files["train"],
@@ -97,14 +109,14 @@ def read_capture(path: str | Path) -> Capture:
     entries = _entries(path, meta)
     cameras, names = _cameras(path, entries, extra)
     frames, frame_count = _frames(path, entries, names, extra)
-    images: dict[View, Path] = {}
+    images: dict[View, Media] = {}
     depths: dict[View, Path] = {}
     for entry, name, frame in zip(entries, names, frames, strict=True):
         if (name, frame) in images:
             raise HoloreelError(
                 f"{path}: {entry.listed} is the second picture of camera {name!r} at one time; take one out."
             )
-        images[name, frame] = entry.path
+        images[name, frame] = entry.media
         if entry.depth:
             depths[name, frame] = entry.depth
     capture = Capture(
@@ -131,23 +143,25 @@ def _relative(file: Path, transforms: Path) -> str:
     return Path(os.path.relpath(file, transforms.parent)).as_posix()
 
 
-def _lens(camera: Camera) -> dict[str, float]:
-    if camera.model != "PINHOLE":
-        raise HoloreelError(f"camera {camera.name!r}: model {camera.model} cannot be written to {FILE_NAME} yet.")
-    return {key: getattr(camera, field) for field, key in _LENS.items()}
+def _lens(camera: Camera) -> dict[str, Any]:
+    """What an entry says of a lens. A lens without k4, k5 and k6 is written as OPENCV, which nerfstudio knows."""
+    distortion = dict(zip(MODELS[camera.model].parameters, camera.distortion, strict=True))
+    model = camera.model
+    if model != "OPENCV_FISHEYE" and not any(distortion.get(key) for key in ("k4", "k5", "k6")):
+        model = "OPENCV"
+        distortion = {key: value for key, value in distortion.items() if key in _MODELS[model]}
+    lens = {key: getattr(camera, field) for field, key in _LENS.items()}
+    return {"camera_model": model, **lens, **distortion}
 
 
-def _same(lenses: dict[str, dict[str, float]], key: str, value: float) -> bool:
-    return all(lens[key] == value for lens in lenses.values())
+def _same(lenses: dict[str, dict[str, Any]], key: str, value: Any) -> bool:
+    return all(lens.get(key) == value for lens in lenses.values())
 
 
 def _entries(path: Path, meta: dict[str, Any]) -> list[_Entry]:
     frames = meta.get("frames")
     if not isinstance(frames, list) or not frames or len(frames) > _MAX_ENTRIES:
         raise HoloreelError(f"{path}: frames must be a list of 1 to {_MAX_ENTRIES} pictures; export it again.")
-    model = meta.get("camera_model", "OPENCV")
-    if model not in _PERSPECTIVE:
-        raise HoloreelError(f"{path}: camera_model {model!r} is not supported; undistort the pictures to OPENCV.")
     world = _applied_transform(path, meta)
     return [_entry(path, meta, index, frame, world) for index, frame in enumerate(frames)]
 
@@ -168,11 +182,7 @@ def _entry(path: Path, meta: dict[str, Any], index: int, frame: Any, world: NDAr
     where = f"{path}: frames[{index}]"
     if not isinstance(frame, dict) or not isinstance(frame.get("file_path"), str):
         raise HoloreelError(f"{where}.file_path is missing; export the capture again.")
-    if frame.get("camera_model", "OPENCV") not in _PERSPECTIVE:
-        raise HoloreelError(f"{where}.camera_model {frame['camera_model']!r} is not supported; undistort the pictures.")
-    for key in _DISTORTION:
-        if frame.get(key, meta.get(key, 0)) != 0:
-            raise HoloreelError(f"{where}: {key} is not 0; undistort the pictures, lens distortion is not supported.")
+    model, distortion = _distortion(where, meta, frame)
     lens: dict[str, Any] = {field: frame.get(key, meta.get(key)) for field, key in _LENS.items()}
     if missing := [_LENS[field] for field, value in lens.items() if value is None]:
         raise HoloreelError(f"{where}: {missing[0]} is missing, there and at the top; export the capture again.")
@@ -181,15 +191,20 @@ def _entry(path: Path, meta: dict[str, Any], index: int, frame: Any, world: NDAr
     except ValueError as error:
         raise HoloreelError(f"{where}.transform_matrix {error}; export the capture again.") from error
     try:
-        camera = Camera(**lens, world_to_camera=invert_rigid(pose))
+        camera = Camera(**lens, world_to_camera=invert_rigid(pose), model=model, distortion=distortion)
     except HoloreelError as error:
         raise HoloreelError(f"{where}: {error}") from error
     own = frame.get("holoreel") or {}
-    name, number = (own.get("camera"), own.get("frame")) if isinstance(own, dict) else (None, None)
+    own = own if isinstance(own, dict) else {}
+    name, number, video_frame = own.get("camera"), own.get("frame"), own.get("video_frame")
+    file = _existing(path, frame["file_path"])
+    media: Media = file
+    if video_frame is not None:
+        media = VideoFrame(file, _integer(path, f"frames[{index}].holoreel.video_frame", video_frame))
     depth = frame.get("depth_file_path")
     time = frame.get("time")
     return _Entry(
-        path=_existing(path, frame["file_path"]),
+        media=media,
         listed=frame["file_path"],
         camera=camera,
         time=None if time is None else _number(path, f"frames[{index}].time", time),
@@ -197,6 +212,28 @@ def _entry(path: Path, meta: dict[str, Any], index: int, frame: Any, world: NDAr
         frame=None if number is None else _integer(path, f"frames[{index}].holoreel.frame", number),
         depth=_existing(path, depth) if isinstance(depth, str) else None,
     )
+
+
+def _distortion(where: str, meta: dict[str, Any], frame: dict[str, Any]) -> tuple[str, tuple[float, ...]]:
+    """Return the camera model of an entry and its parameters: the least model that has all that are not 0."""
+    model = frame.get("camera_model", meta.get("camera_model", "OPENCV"))
+    if not isinstance(model, str) or model not in _MODELS:
+        raise HoloreelError(
+            f"{where}: camera_model {str(model)[:40]!r} is not supported; undistort the pictures to OPENCV."
+        )
+    values: dict[str, float] = {}
+    for key in _DISTORTION:
+        value = finite(frame.get(key, meta.get(key, 0)))
+        if value is None:
+            raise HoloreelError(f"{where}: {key} must be a finite number; export the capture again.")
+        if value != 0 and key not in _MODELS[model]:
+            raise HoloreelError(
+                f"{where}: {key} is not a parameter of {model}; set it to 0, or say FULL_OPENCV if it is OpenCV's."
+            )
+        values[key] = value
+    names = ("OPENCV_FISHEYE",) if model == "OPENCV_FISHEYE" else ("PINHOLE", "OPENCV", "FULL_OPENCV")
+    least = next(name for name in names if {key for key in values if values[key]} <= {*MODELS[name].parameters})
+    return least, tuple(values[key] for key in MODELS[least].parameters)
 
 
 def _existing(path: Path, name: str) -> Path:
@@ -242,8 +279,8 @@ def _cameras(path: Path, entries: list[_Entry], extra: dict[str, Any] | None) ->
 
 
 def _pose_key(camera: Camera) -> tuple[float, ...]:
-    values = [camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy]
-    return (*values, *np.round(camera.world_to_camera[:3].ravel(), 7).tolist())
+    values = [camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy, *camera.distortion]
+    return (float(list(MODELS).index(camera.model)), *values, *np.round(camera.world_to_camera[:3].ravel(), 7).tolist())
 
 
 def _names(entries: list[_Entry], keys: list[tuple[float, ...]]) -> dict[tuple[float, ...], str]:
@@ -251,8 +288,9 @@ def _names(entries: list[_Entry], keys: list[tuple[float, ...]]) -> dict[tuple[f
     stems: dict[tuple[float, ...], set[str]] = {}
     folders: dict[tuple[float, ...], set[str]] = {}
     for entry, key in zip(entries, keys, strict=True):
-        stems.setdefault(key, set()).add(entry.path.stem)
-        folders.setdefault(key, set()).add(entry.path.parent.name)
+        file = media_path(entry.media)
+        stems.setdefault(key, set()).add(file.stem)
+        folders.setdefault(key, set()).add(file.parent.name)
     for candidates in (folders, stems):
         found = [next(iter(values)) for values in candidates.values() if len(values) == 1]
         if len(set(found)) == len(candidates) and all(found):

@@ -85,7 +85,7 @@ def make_warp(real: Camera, resolution: float = RESOLUTION, samples: int = SAMPL
     limit = math.tan(math.radians(MAX_FIELD_DEGREES) / 2)
     covered = (np.abs(slopes) <= limit).all(axis=2)  # NaN is not
     # Sampling inside a pixel takes its neighbors' rays too.
-    valid = sliding_window_view(covered, (3, 3)).all(axis=(2, 3))
+    valid = np.asarray(sliding_window_view(covered, (3, 3)).all(axis=(2, 3)))
     if not valid.any():
         raise HoloreelError(f"camera {real.name!r}: its {real.model} lens sees nothing; check its distortion.")
     seen = slopes[covered]

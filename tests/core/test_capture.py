@@ -4,6 +4,7 @@
 import json
 import math
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -136,6 +137,43 @@ def test_shared_lens_goes_to_the_top(tmp_path: Path, capture: Capture) -> None:
     assert "train_filenames" not in meta
 
 
+def test_lenses(tmp_path: Path, capture: Capture) -> None:
+    """All models at once, and what nerfstudio reads of them."""
+    lenses: dict[str, tuple[str, tuple[float, ...]]] = {
+        "left": ("OPENCV", (0.1, -0.02, 0.003, -0.004)),
+        "middle": ("OPENCV_FISHEYE", (0.01, 0.02, -0.03, 0.004)),
+        "right": ("FULL_OPENCV", (0.1, 0.2, 0.003, 0.004, 0.5, 0.6, 0.7, 0.8)),
+    }
+    cameras = {
+        name: replace(camera, model=lenses[name][0], distortion=lenses[name][1])
+        for name, camera in capture.cameras.items()
+    }
+    path = write_capture(tmp_path, replace(capture, cameras=cameras))
+    back = read_capture(path)
+    assert {name: (camera.model, camera.distortion) for name, camera in back.cameras.items()} == lenses
+    entries = {frame["holoreel"]["camera"]: frame for frame in json.loads(path.read_text())["frames"]}
+    assert (entries["left"]["camera_model"], entries["left"]["p2"]) == ("OPENCV", -0.004)
+    assert (entries["middle"]["camera_model"], entries["middle"]["k4"]) == ("OPENCV_FISHEYE", 0.004)
+    assert entries["right"]["camera_model"] == "FULL_OPENCV"
+    brown = replace(cameras["left"], model="FULL_OPENCV", distortion=(0.1, 0, 0, 0, 0.2, 0, 0, 0))
+    path = write_capture(tmp_path, replace(capture, cameras=dict.fromkeys(cameras, brown)))
+    meta = json.loads(path.read_text())
+    assert (meta["camera_model"], meta["k1"], meta["k3"]) == ("OPENCV", 0.1, 0.2)
+    assert "k4" not in meta
+
+    lens = replace(cameras["left"], distortion=(0.1, 0, 0, 0))
+    path = write_capture(
+        tmp_path, replace(capture, cameras={name: replace(lens, world_to_camera=c.world_to_camera, name=name)
+                                            for name, c in cameras.items()})
+    )  # fmt: skip
+    meta = json.loads(path.read_text())
+    for key in ("k2", "p1", "p2"):
+        del meta[key]
+    meta["camera_model"] = "SIMPLE_RADIAL"
+    path.write_text(json.dumps(meta))
+    assert read_capture(path).cameras["middle"].distortion == (0.1, 0, 0, 0)
+
+
 @pytest.mark.parametrize("ends_at_one", [False, True])
 def test_foreign_file_with_times(tmp_path: Path, capture: Capture, ends_at_one: bool) -> None:
     """Without our keys: cameras from poses and folders, frames from times, as D-NeRF writes them too."""
@@ -234,9 +272,11 @@ def drop(key: str) -> Callable[[dict[str, Any]], None]:
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (top(camera_model="OPENCV_FISHEYE"), "camera_model 'OPENCV_FISHEYE'"),
+        (top(camera_model="EQUIRECTANGULAR"), "camera_model 'EQUIRECTANGULAR'"),
         (top(camera_model="EQUIRECTANGULAR"), "camera_model"),
-        (top(k1=0.1), "k1"),
+        (top(k4=0.1), "k4 is not a parameter of OPENCV"),
+        (top(camera_model="OPENCV_FISHEYE", p1=0.1), "p1 is not a parameter of OPENCV_FISHEYE"),
+        (top(k2="a"), "k2 must be a finite number"),
         (top(frames=[]), "frames"),
         (top(frames={}), "frames"),
         (top(frames=[3]), r"frames\[0\]"),
@@ -272,7 +312,7 @@ def drop(key: str) -> Callable[[dict[str, Any]], None]:
         (entry(time=math.inf), "time"),
         (entry(file_path="../../nothing.png"), "nothing.png missing"),
         (entry(camera_model="FISHEYE"), "camera_model"),
-        (entry(p1=0.1), "p1"),
+        (entry(p1=math.nan), "p1"),
     ],
 )
 def test_lying_files_are_refused(
