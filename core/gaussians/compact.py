@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 
 from ..errors import HoloreelError
 from ..files import atomic_path, finite
-from .model import ALWAYS_LOG_SCALE, FEATURES, ROWS, SpacetimeGaussians
+from .model import ALWAYS_LOG_SCALE, FEATURES, ROWS, SpacetimeGaussians, recentered, unit_rotations
 from .ply import usable_rows
 
 MAGIC = b"STGC"
@@ -84,25 +84,11 @@ def pack(gaussians: SpacetimeGaussians, steps: dict[str, float] = STEPS) -> byte
 
 def _prepared(model: SpacetimeGaussians, center_step: float) -> SpacetimeGaussians:
     """Return the same Gaussians around rounded temporal centers, with unit quaternions, all within the limits."""
-    centers = np.round(model.trbf_centers.astype(np.float64) / center_step) * center_step
-    d = (centers - model.trbf_centers)[:, None]
-    b1, b2, b3 = model.motions.astype(np.float64).transpose(1, 0, 2)
-    quats, omegas = model.quats.astype(np.float64), model.omegas.astype(np.float64)
-    turned = quats.any(axis=1, keepdims=True)  # where not, ω alone says how, at all times
-    quats, omegas = np.where(turned, quats + d * omegas, omegas), np.where(turned, omegas, 0.0)
-    # Only the direction of q(t) counts: a common factor of both coefficients, its sign included, is free.
-    length = np.linalg.norm(quats, axis=1, keepdims=True)
-    factor = np.where(quats[:, :1] < 0, -1.0, 1.0) / np.where(length > 0, length, 1.0)
-    arrays = dict(vars(model)) | {
-        "means": model.means + d * (b1 + d * (b2 + d * b3)),
-        "motions": np.stack([b1 + d * (2 * b2 + 3 * d * b3), b2 + 3 * d * b3, b3], axis=1),
-        "quats": quats * factor,
-        "omegas": omegas * factor,
-        "trbf_centers": centers,
-    }
+    model = recentered(model, np.round(model.trbf_centers.astype(np.float64) / center_step) * center_step)
+    model.quats, model.omegas = (array.astype(np.float32) for array in unit_rotations(model))
     for name, (low, high) in _LIMITS.items():
-        arrays[name] = arrays[name].clip(low, high)
-    return SpacetimeGaussians(**arrays)
+        setattr(model, name, getattr(model, name).clip(low, high))
+    return model
 
 
 def _morton(means: NDArray[np.float32]) -> NDArray[np.uint64]:

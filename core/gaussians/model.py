@@ -208,6 +208,41 @@ class SpacetimeGaussians:
         return largest > np.median(largest) + np.log(1000.0) if len(self) else np.zeros(0, dtype=bool)
 
 
+def recentered(model: SpacetimeGaussians, centers: NDArray[np.float64]) -> SpacetimeGaussians:
+    """Return the same motion and rotation written around other temporal `centers` (N,), exactly but for rounding.
+
+    Meant for centers that a file format rounds: then only the temporal opacity (and time feature) moves with them.
+    """
+    d = (centers - model.trbf_centers)[:, None]
+    b1, b2, b3 = model.motions.astype(np.float64).transpose(1, 0, 2)
+    turned = model.quats.any(axis=1, keepdims=True)  # where not, only the direction of dt · ω counts, at all times
+    return SpacetimeGaussians(
+        **vars(model)
+        | {
+            "means": model._positions(d[:, 0]),
+            "motions": np.stack([b1 + d * (2 * b2 + 3 * d * b3), b2 + 3 * d * b3, b3], axis=1),
+            "quats": np.where(turned, model.quats + d * model.omegas, 0.0),
+            "trbf_centers": centers,
+        }
+    )
+
+
+def unit_rotations(
+    model: SpacetimeGaussians,
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return `quats` and `omegas` (N, 4) that turn as the model's do, with quats of length 1 and w ≥ 0, or zero.
+
+    Only the direction of q(t) counts, so that a common factor is free; where quats are zero, ω alone says how things
+    are turned, at all times but one. Rows remain zero that are not turned at all.
+    """
+    quats, omegas = model.quats.astype(np.float64), model.omegas.astype(np.float64)
+    turned = quats.any(axis=1, keepdims=True)
+    quats, omegas = np.where(turned, quats, omegas), np.where(turned, omegas, 0.0)
+    length = np.linalg.norm(quats, axis=1, keepdims=True)
+    factor = np.where(quats[:, :1] < 0, -1.0, 1.0) / np.where(length > 0, length, 1.0)
+    return quats * factor, omegas * factor
+
+
 def rows(count: int) -> str:
     """Return `1 row` or `1,234 rows`, for reports."""
     return "1 row" if count == 1 else f"{count:,} rows"

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Read `.splatv`, the files of the splaTV web viewer (github.com/antimatter15/splaTV, hybrid.js). Needs numpy only.
+"""`.splatv`, the files of the splaTV web viewer (github.com/antimatter15/splaTV, hybrid.js). Needs numpy only.
 
 Little-endian: u32 magic 0x674B, u32 length of a JSON text, the text (a list of chunks `{type, size, texwidth,
 texheight, ...}`), then the chunks' payloads in order. The payload of a chunk "splat" is a texture 4096 texels wide;
 64 bytes make one lite Spacetime Gaussian (`_RECORD`). Writers in use leave out the padding that fills the last row of
-the texture.
+the texture; this one does not.
 """
 
 import json
@@ -15,8 +15,10 @@ from typing import Any, BinaryIO, TypeGuard
 import numpy as np
 from numpy.typing import NDArray
 
+from ..camera import Camera
 from ..errors import HoloreelError
-from .model import ALWAYS_LOG_SCALE, SpacetimeGaussians, logit, rows
+from ..files import atomic_path
+from .model import ALWAYS_LOG_SCALE, SpacetimeGaussians, logit, recentered, rows, sigmoid, unit_rotations
 from .ply import usable_rows
 
 MAGIC = 0x674B
@@ -38,6 +40,8 @@ _RECORD = np.dtype(
 # the logarithm, and as invisible as a zero.
 _LEAST_HALF = 2.0**-25
 _LEAST_OPACITY = 0.25 / 255.0
+_MOST_HALF = 65504.0  # the largest finite half-precision number
+_SMALLEST_HALF = 2.0**-14  # the smallest that every graphics card keeps
 
 
 def read_splatv(path: str | Path) -> tuple[SpacetimeGaussians, list[str]]:
@@ -59,6 +63,60 @@ def read_splatv(path: str | Path) -> tuple[SpacetimeGaussians, list[str]]:
         report.append(f"{rows(int(padding.sum()))} of padding left out.")
         records = records[~padding]
     return usable_rows(path, _decode(records, report), report), report
+
+
+def write_splatv(path: str | Path, gaussians: SpacetimeGaussians, camera: Camera) -> None:
+    """Write a lite model for splaTV, atomically; `camera` is where its viewer begins.
+
+    The most important Gaussians (volume times opacity) come first, because the viewer shows what has arrived. Half
+    precision rounds most parameters, colors and opacities have 8 bits. All values are finite and quaternions of length
+    1 at the temporal center. Rows that cannot be drawn are left out; a full model is a ValueError: flatten it first.
+    """
+    if gaussians.variant != "lite":
+        raise ValueError("a .splatv holds lite models")
+    records = _encode(gaussians.without_bad_rows())
+    height = max(1, -(-records.nbytes // _ROW_BYTES))
+    pose = camera.camera_to_world
+    view = {
+        "id": 0,
+        "img_name": camera.name or "view",
+        "width": camera.width,
+        "height": camera.height,
+        "position": pose[:3, 3].tolist(),
+        "rotation": pose[:3, :3].tolist(),
+        "fy": camera.fy,
+        "fx": camera.fx,
+    }
+    size = height * _ROW_BYTES
+    chunk = {"type": "splat", "size": size, "texwidth": _TEXTURE_WIDTH, "texheight": height, "cameras": [view]}
+    text = json.dumps([chunk], allow_nan=False).encode()
+    with atomic_path(path) as temporary:
+        head = struct.pack("<II", MAGIC, len(text)) + text
+        temporary.write_bytes(head + records.tobytes() + bytes(size - records.nbytes))
+
+
+def _encode(model: SpacetimeGaussians) -> NDArray[np.void]:
+    """Return the records of a model, most important first."""
+    model = recentered(model, _half(model.trbf_centers).astype(np.float64))
+    quats, omegas = unit_rotations(model)
+    quats[~quats.any(axis=1)] = (1.0, 0.0, 0.0, 0.0)  # the viewer divides by their length
+    with np.errstate(over="ignore"):
+        scales = np.exp(model.log_scales.astype(np.float64))
+        widths = np.exp(model.trbf_log_scales.astype(np.float64))
+    opacities = sigmoid(model.opacity_logits.astype(np.float64))
+    records = np.zeros(len(model), _RECORD)
+    records["position"] = model.means
+    records["rotation"], records["omega"] = _half(quats), _half(omegas)
+    records["scale"][:, :3] = _half(scales.clip(_SMALLEST_HALF))
+    records["rgba"] = np.round(255.0 * np.column_stack([model.features, opacities]).clip(0.0, 1.0))
+    records["motion"][:, :9] = _half(model.columns("motions"))
+    records["temporal"] = _half(np.column_stack([model.trbf_centers, widths.clip(_SMALLEST_HALF)]))
+    importance = model.log_scales.astype(np.float64).sum(axis=1) + np.log(opacities.clip(1e-30))
+    return records[np.argsort(-importance, kind="stable")]
+
+
+def _half(values: NDArray[Any]) -> NDArray[np.float16]:
+    return values.clip(-_MOST_HALF, _MOST_HALF).astype(np.float16)
 
 
 def _decode(records: NDArray[np.void], report: list[str]) -> SpacetimeGaussians:
