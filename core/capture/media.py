@@ -171,17 +171,23 @@ class _Decoder:
         raise EOFError("the video ends before it")
 
     def _timed(self, number: int, pts: tuple[int, ...]) -> "av.VideoFrame":
+        import av
+
         at = bisect_right(self.index.keys, number) - 1
         near = self.next <= number and (at < 0 or self.index.keys[at] <= self.next + _AHEAD)
         while True:
-            if not near:
-                self._jump(pts[self.index.keys[at]] if at >= 0 else None)
-            for frame in self._frames:
-                if frame.pts == pts[number]:
-                    self.next = number + 1
-                    return frame
-                if frame.pts is None or frame.pts > pts[number]:
-                    break  # the jump went too far
+            try:
+                if not near:
+                    self._jump(pts[self.index.keys[at]] if at >= 0 else None)
+                for frame in self._frames:
+                    if frame.pts == pts[number]:
+                        self.next = number + 1
+                        return frame
+                    if frame.pts is None or frame.pts > pts[number]:
+                        break  # the jump went too far
+            except av.FFmpegError:
+                if not near:  # on the way from another frame, the damage may lie before this one
+                    raise
             if not near and at < 0:
                 raise ValueError("there is no frame at its timestamp")
             at, near = at if near else at - 1, False
