@@ -7,6 +7,7 @@ from pathlib import Path
 import bpy
 from mathutils import Matrix
 
+from ..core.gaussians.flat import flattened
 from ..core.gaussians.model import SpacetimeGaussians
 from ..core.reel import Loaded, load_gaussians
 from . import attributes
@@ -41,7 +42,7 @@ def import_reel(
     up: str | None = None,
     set_scene_timing: bool = False,
 ) -> bpy.types.Object:
-    """Read a `.reel`, `.ply` or `.splatv` and return the object that plays it; see `add_reel`.
+    """Read a `.reel`, `.ply`, `.stgc` or `.splatv` and return the object that plays it; see `add_reel`.
 
     Raises `HoloreelError` for a missing, damaged or unknown file; then nothing is added.
     """
@@ -72,7 +73,8 @@ def add_reel(
         _set_scene_timing(scene, loaded, start)
     rate = scene.render.fps / scene.render.fps_base
     timeline = Timeline(loaded.frame_count, start=start, speed=loaded.fps / rate if pace == REAL_TIME else 1.0)
-    created = create_reel_object(context, loaded.path.stem, loaded.gaussians, timeline)
+    shown = flattened(loaded.gaussians, loaded.decoder, loaded.viewpoint)
+    created = create_reel_object(context, loaded.path.stem, shown, timeline)
     if up is not None:
         created.matrix_world = UPRIGHT[(loaded.up or "Z") if up == FROM_FILE else up]
     created[INFO] = {
@@ -89,8 +91,9 @@ def add_reel(
 def report_of(loaded: Loaded) -> list[str]:
     """Say in sentences what was assumed, what is unusual, and what will not be shown."""
     report = list(loaded.report)
-    if loaded.gaussians.variant == "full":
-        report.append("A full model: the base color is shown, without what its decoder adds (an approximation).")
+    if loaded.decoder is not None:
+        place = "from no place in particular" if loaded.viewpoint is None else "as seen from the reel's viewpoint"
+        report.append(f"A full model: each Gaussian shows one color, decoded {place} (an approximation).")
     if loaded.reel is not None and len(loaded.reel.segments) > 1:
         report.append(f"The first of {len(loaded.reel.segments)} segments is shown.")
     return report

@@ -19,13 +19,13 @@ class HOLOREEL_OT_import_reel(bpy.types.Operator, ImportHelper):
     bl_idname = "holoreel.import_reel"
     bl_label = "Import Reel"
     bl_description = (
-        "Import Spacetime Gaussians from .reel, .ply or .splatv files; each becomes a point cloud that plays "
+        "Import Spacetime Gaussians from .reel, .ply, .stgc or .splatv files; each becomes a point cloud that plays "
         "on the timeline"
     )
     bl_options = {"REGISTER", "UNDO"}
 
     filename_ext = ".reel"
-    filter_glob: bpy.props.StringProperty(default="*.reel;*.ply;*.splatv", options={"HIDDEN"})
+    filter_glob: bpy.props.StringProperty(default="*.reel;*.ply;*.stgc;*.splatv", options={"HIDDEN"})
     files: bpy.props.CollectionProperty(type=bpy.types.OperatorFileListElement, options={"HIDDEN", "SKIP_SAVE"})
     directory: bpy.props.StringProperty(subtype="DIR_PATH", options={"HIDDEN", "SKIP_SAVE"})
 
@@ -84,7 +84,7 @@ class HOLOREEL_OT_import_reel(bpy.types.Operator, ImportHelper):
 
 
 def _draw_menu(self: bpy.types.Menu, _context: bpy.types.Context) -> None:
-    self.layout.operator(HOLOREEL_OT_import_reel.bl_idname, text="Holoreel reel (.reel, .ply, .splatv)")
+    self.layout.operator(HOLOREEL_OT_import_reel.bl_idname, text="Holoreel reel (.reel, .ply, .stgc, .splatv)")
 
 
 def register() -> None:

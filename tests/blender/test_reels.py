@@ -13,8 +13,9 @@ from holoreel.addon import attributes, compat, reels
 from holoreel.addon.nodes.reel import DISPLAY, LINEAR, LOOKS, POINTS
 from holoreel.addon.timeline import HOLD, LOOP, PING_PONG, Timeline
 from holoreel.core.errors import HoloreelError
+from holoreel.core.gaussians.decoder import Decoder
 from holoreel.core.gaussians.model import EvaluatedGaussians, SpacetimeGaussians
-from holoreel.core.reel import save_gaussians
+from holoreel.core.reel import SegmentPayload, save_gaussians, write_segments
 from mathutils import Vector
 from numpy.typing import NDArray
 
@@ -238,11 +239,39 @@ def test_real_time_and_scene_timing(random_model: Model, tmp_path: Path) -> None
     assert scene.render.fps / scene.render.fps_base == pytest.approx(29.97)
 
 
+def test_compact_full_reels_show_decoded_colors(random_model: Model, tmp_path: Path) -> None:
+    """The first of two segments, quantised, with one color for each Gaussian."""
+    random = np.random.default_rng(3)
+    decoder = Decoder(random.normal(size=(6, 12)), random.normal(size=(3, 6)), "sigmoid")
+    parts = [SegmentPayload(random_model(60, i, features=9), decoder, 1 + 5 * i, 5) for i in range(2)]
+    path = tmp_path / "walk.reel"
+    write_segments(path, parts, fps=25, frame_start=1, viewpoint=(0.0, 0.5, -1.0), suffix=".stgc")
+    reel = reels.import_reel(bpy.context, path)
+    show_points(reel)
+    seek(3)
+    model = reels.load_gaussians(path).gaussians
+    shown, truth = evaluated(reel), model.evaluate(0.4)
+    alive = truth.take(truth.alive)
+    assert len(shown["position"]) == len(alive) > 20
+    np.testing.assert_allclose(shown["position"], alive.means, rtol=1e-6, atol=1e-5)
+    still, eye = model.take(truth.alive), np.array([0.0, 0.5, -1.0])
+    features = still.features.astype(np.float64)
+    features[:, 6:] = 0.0
+    rays = (still.means - eye) / np.linalg.norm(still.means - eye, axis=1, keepdims=True)
+    inputs = np.concatenate([features[:, 3:], np.broadcast_to(eye, rays.shape), rays], axis=1)
+    raw = features[:, :3] + np.maximum(inputs @ decoder.hidden.T, 0.0) @ decoder.output.T
+    np.testing.assert_allclose(shown["rgb"][:, :3], 1 / (1 + np.exp(-raw)), atol=1e-5)
+    report = reel[reels.INFO]["report"]
+    assert "one color" in report
+    assert "first of 2 segments" in report
+
+
 def test_refused_files_add_nothing(tmp_path: Path) -> None:
     (tmp_path / "a.reel").write_text(json.dumps({"kind": "video"}))
     (tmp_path / "b.ply").write_bytes(b"ply\nformat binary_little_endian 1.0\n")
     (tmp_path / "c.splatv").write_bytes(b"\0" * 100)
-    for name in ("a.reel", "b.ply", "c.splatv", "absent.ply", "d.txt"):
+    (tmp_path / "e.stgc").write_bytes(b"STGC" * 100)
+    for name in ("a.reel", "b.ply", "c.splatv", "e.stgc", "absent.ply", "d.txt"):
         with pytest.raises(HoloreelError, match=name):
             reels.import_reel(bpy.context, tmp_path / name)
     assert not bpy.data.objects
