@@ -79,35 +79,44 @@ def worst_patches(pictures: Sequence[Patches], share: float, contrast: float) ->
     ]
 
 
-def depth_range(depth: Floats, alpha: Floats, far: float) -> tuple[float, float] | None:
-    """Return how near and how far a camera's rays should reach, from its coarse depth map (H, W) and alpha (H, W).
+def depth_range(depth: Floats, alpha: Floats, patches: Patches, size: int, far: float) -> NDArray[np.float64] | None:
+    """Return how near and how far the ray of each patch should reach, (P, 2), from a camera's coarse depth map.
 
-    From what the nearest Gaussians cover to `far` times the depth of the farthest; None where it sees none.
+    `depth` and `alpha` are (H, W). A ray begins at the nearest that the patch and its neighbors show (where they show
+    nothing, that the camera sees), so that nothing is put before what is known to be free, and ends at `far` times the
+    farthest that the camera sees. None where it sees none.
     """
-    seen = depth[(alpha >= OPAQUE) & np.isfinite(depth) & (depth > 0)]
-    if not len(seen):
+    known = (alpha >= OPAQUE) & np.isfinite(depth) & (depth > 0)
+    if not known.any():
         return None
-    near, farthest = np.quantile(seen, (NEAR_SHARE, FAR_SHARE))
-    return float(near), float(farthest * far)
+    nearest, farthest = np.quantile(depth[known], (NEAR_SHARE, FAR_SHARE))
+    reach = np.empty((len(patches.errors), 2))
+    reach[:, 1] = farthest * far
+    for row, (u, v) in enumerate(patches.centers):
+        window = tuple(slice(max(int(x - 1.5 * size), 0), int(x + 1.5 * size)) for x in (v, u))
+        seen = depth[window][known[window]]
+        reach[row, 0] = np.quantile(seen, NEAR_SHARE) if len(seen) else nearest
+    reach[:, 0] = np.minimum(reach[:, 0], farthest)
+    return reach
 
 
 def sample_rays(
     camera: Camera,
     patches: Patches,
     size: int,
-    reach: tuple[float, float],
+    reach: NDArray[np.float64],
     config: GuidedConfig,
     rng: np.random.Generator,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return points (P · samples, 3) along the rays through the patches' centers, and their sizes (P · samples,).
 
-    Depths are uniform over `reach`, one in each of equal stretches; centers are off by a little noise. A size is the
-    standard deviation that covers the patch.
+    Depths are uniform over each patch's `reach` (P, 2), one in each of equal stretches; centers are off by a little
+    noise. A size is the standard deviation that covers the patch.
     """
-    near, far = reach
+    near, far = reach.T
     count = len(patches.errors)
     steps = (np.arange(config.samples) + rng.random((count, config.samples))) / config.samples
-    depths = (near + (far - near) * steps).ravel()
+    depths = (near[:, None] + (far - near)[:, None] * steps).ravel()
     pixels = np.repeat(patches.centers, config.samples, axis=0)
     pixels = pixels + rng.normal(0.0, config.noise * size, pixels.shape)
     points = camera.unproject(pixels, depths)

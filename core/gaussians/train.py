@@ -5,7 +5,7 @@ import math
 import signal
 import threading
 import time
-from collections import Counter, OrderedDict
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
@@ -17,6 +17,7 @@ from torch import Tensor
 
 from ..camera import Camera
 from ..capture import Capture, View
+from ..capture.stream import PictureStream
 from ..errors import HoloreelError
 from ..render.contract import Rendering, Rules
 from ..render.view import DecoderTensors, render_view
@@ -46,42 +47,6 @@ class Progress:
     psnr: float
     gaussians: int
     seconds_left: float
-
-
-class PictureQueue:
-    """Pictures of a capture in a random order, each once before any comes again; the least recently used make room."""
-
-    def __init__(
-        self, capture: Capture, views: list[View], background: tuple[float, float, float], seed: int, limit_bytes: int
-    ):
-        self.capture, self.views, self.background, self.limit = capture, views, background, limit_bytes
-        self.rng = torch.Generator().manual_seed(seed)
-        self.queue: list[int] = []
-        self.bytes = 0
-        self.pictures: OrderedDict[View, np.ndarray] = OrderedDict()
-
-    def next(self) -> tuple[View, np.ndarray]:
-        """Return a view and its picture, (H, W, 3) uint8 over the background."""
-        if not self.queue:
-            self.queue = torch.randperm(len(self.views), generator=self.rng).tolist()
-        view = self.views[self.queue.pop()]
-        if view in self.pictures:
-            self.pictures.move_to_end(view)
-        else:
-            self.pictures[view] = np.ascontiguousarray(self.capture.image(*view, background=self.background))
-            self.bytes += self.pictures[view].nbytes
-            while self.bytes > self.limit and len(self.pictures) > 1:
-                self.bytes -= self.pictures.popitem(last=False)[1].nbytes
-        return view, self.pictures[view]
-
-    def state(self) -> dict[str, object]:
-        """Where the sequence is."""
-        return {"rng": self.rng.get_state(), "queue": list(self.queue)}
-
-    def load_state(self, state: Mapping) -> None:
-        """Go on where `state` was taken."""
-        self.rng.set_state(state["rng"])
-        self.queue = list(state["queue"])
 
 
 @contextmanager
@@ -165,7 +130,7 @@ class Trainer:
         if seeds is None:
             seeds = self._fitted(gaussians_from_points(points, config, np.random.default_rng(config.seed)))
         self.parameters = Parameters(as_trained(seeds, config), self._network(decoder), self.measure)
-        self.pictures = PictureQueue(capture, self.views, config.background, config.seed, config.picture_memory)
+        self.pictures = PictureStream(capture, self.views, config.background, config.seed, config.picture_memory)
         control = DensityControl if config.strategy == "density" else McmcControl
         self.control: DensityControl | McmcControl = control(config, self.scene, self.times)
         self.iteration = 0
@@ -249,7 +214,7 @@ class Trainer:
         rendering = self.render(camera, self.capture.time(view[1]), training=True)
         colors, valid = rendering.features, valid_pixels(camera)
         if valid is not None:  # equal outside, so that nothing is learned there
-            colors, target = colors * valid[..., None], target * valid[..., None]
+            colors, target = colors * valid[..., None].to(colors.device), target * valid[..., None]
         loss, squared_error = self.backend.picture_loss(colors, target, self.config.dssim_weight)
         value = float(loss.detach())
         if not math.isfinite(value):
@@ -333,12 +298,13 @@ class Trainer:
         count = min(len(self.views), max(GUIDED_VIEWS, len(self.scene.centers)))
         views = [self.views[index] for index in torch.randperm(len(self.views), generator=self.rng)[:count].tolist()]
         looked = [self._measure_view(view) for view in views]
-        chosen = worst_patches([patches for patches, _ in looked], config.share, config.contrast)
+        chosen = worst_patches([patches for patches, *_ in looked], config.share, config.contrast)
         random = np.random.default_rng([self.config.seed, self.iteration])
         room = self.config.density.max_gaussians - len(self.parameters)
-        for view, patches, (_, reach) in zip(views, chosen, looked, strict=True):
+        for view, patches, (_, depth, alpha) in zip(views, chosen, looked, strict=True):
             patches = patches.take(np.arange(min(len(patches.errors), max(room, 0) // config.samples)))
-            if reach is None or not len(patches.errors):
+            reach = depth_range(depth, alpha, patches, config.patch, config.far)
+            if reach is None or not len(reach):
                 continue
             camera = self.capture.cameras[view[0]]
             points, sizes = sample_rays(camera, patches, config.patch, reach, config, random)
@@ -350,16 +316,16 @@ class Trainer:
             self.parameters.append({name: torch.from_numpy(getattr(fresh, name)) for name in self.parameters.tensors})
             room -= len(fresh)
 
-    def _measure_view(self, view: View) -> tuple[Patches, tuple[float, float] | None]:
-        """Return a view's patches and how far its rays should reach."""
-        config, camera = self.config.guided, self.capture.cameras[view[0]]
+    def _measure_view(self, view: View) -> tuple[Patches, np.ndarray, np.ndarray]:
+        """Return a view's patches with their errors, its coarse depth map, and its alpha."""
+        camera = self.capture.cameras[view[0]]
         truth = self.capture.image(*view, background=self.config.background).astype(np.float32) / 255.0
         rendering = self.render(camera, self.capture.time(view[1]))
         valid = valid_pixels(camera)
         patches = measure_patches(
-            rendering.features.numpy(), truth, config.patch, None if valid is None else valid.numpy()
+            rendering.features.numpy(), truth, self.config.guided.patch, None if valid is None else valid.numpy()
         )
-        return patches, depth_range(rendering.depth.numpy(), rendering.alpha.numpy(), config.far)
+        return patches, rendering.depth.numpy(), rendering.alpha.numpy()
 
     def gaussians(self) -> SpacetimeGaussians:
         """Copy the trained Gaussians out."""

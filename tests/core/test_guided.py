@@ -59,15 +59,24 @@ def test_patches_with_invalid_pixels_are_left_out() -> None:
     assert patches.errors.max() < 0.02
 
 
-def test_rays_reach_from_the_nearest_to_beyond_the_farthest() -> None:
-    depth = np.tile(np.linspace(2.0, 6.0, 100, dtype=np.float32), (20, 1))
+def at(*centers: tuple[float, float]) -> Patches:
+    """Patches at some pixels."""
+    count = len(centers)
+    return Patches(np.array(centers, np.float64), np.ones(count, np.float32), np.zeros((count, 3), np.float32))
+
+
+def test_rays_reach_from_what_their_surroundings_show_to_beyond_the_farthest() -> None:
+    depth = np.tile(np.linspace(2.0, 6.0, 100, dtype=np.float32), (40, 1))
     alpha = np.ones_like(depth)
-    alpha[:, :25] = 0.2  # nearly nothing there: its depth says nothing
+    alpha[:, :50] = 0.2  # nearly nothing there: its depth says nothing
     depth[0, 99] = np.nan
-    near, far = depth_range(depth, alpha, 1.5)
-    assert 3.0 <= near < 3.2
-    assert 1.5 * 5.8 < far <= 1.5 * 6.0
-    assert depth_range(depth, 0 * alpha, 1.5) is None
+    reach = depth_range(depth, alpha, at((80.0, 20.0), (20.0, 20.0), (96.0, 4.0)), SIZE, 1.5)
+    # Three patches around column 80 begin at column 68; around column 20 nothing is known.
+    np.testing.assert_allclose(reach[:, 0], [depth[1, 68], depth[1, 50], depth[1, 84]], rtol=0.01)
+    assert (reach[:, 1] > 1.5 * 5.8).all()
+    assert (reach[:, 1] <= 1.5 * 6.0).all()
+    assert depth_range(depth, 0 * alpha, at((80.0, 20.0)), SIZE, 1.5) is None
+    assert depth_range(depth, alpha, at(), SIZE, 1.5).shape == (0, 2)
 
 
 @pytest.mark.parametrize("unit", [1e-3, 1.0, 1e4])
@@ -77,16 +86,16 @@ def test_new_gaussians_lie_on_the_rays_and_within_reach(unit: float) -> None:
     centers = np.array([[44.0, 20.0], [4.0, 36.0]])
     patches = Patches(centers, np.ones(2, np.float32), np.eye(3, dtype=np.float32)[:2])
     config = GuidedConfig(samples=16, noise=0.05)
-    reach = (2.0 * unit, 9.0 * unit)
+    reach = np.array([[2.0, 9.0], [5.0, 6.0]]) * unit
     points, sizes = sample_rays(camera, patches, SIZE, reach, config, np.random.default_rng(0))
     uv, depth = camera.project(points)
+    assert points.shape == (32, 3)
     off = np.abs(uv - np.repeat(centers, 16, axis=0))
     assert off.max() < 5 * 0.05 * SIZE
     assert off.max() > 0
-    assert depth.min() >= reach[0] * (1 - 1e-9)
-    assert depth.max() <= reach[1] * (1 + 1e-9)
     # One in each sixteenth of the reach: uniform, and no stretch is left out.
-    stretch = np.floor((depth - reach[0]) / (reach[1] - reach[0]) * 16).reshape(2, 16)
+    near, far = np.repeat(reach, 16, axis=0).T
+    stretch = np.floor((depth - near) / (far - near) * 16).reshape(2, 16)
     np.testing.assert_array_equal(stretch, np.tile(np.arange(16.0), (2, 1)))
     # Three standard deviations to each side cover the patch, and not much more.
     np.testing.assert_allclose(sizes * 70.0 / depth, SIZE / 4)

@@ -441,3 +441,23 @@ def test_distorted_lenses_train_and_what_they_cannot_see_does_not_count(tmp_path
         trainers[-1].run(lambda progress: None)
     assert_same(*trainers)
     assert heldout_psnr(trainers[0], first) > before + 2
+
+
+def test_guided_sampling_fills_a_hole_that_the_seeds_left(tmp_path: Path) -> None:
+    """Half of the wall has no seeds: density control has to creep in from its border, guided sampling has not."""
+    whole = recorded(tmp_path, around())
+    seeds = {}
+    for frame in whole.seeds:
+        points = whole.seed_points(frame)
+        kept = (points.xyz[:, 1] < 0.2) | (points.xyz[:, 0] < -0.3)
+        seeds[frame] = tmp_path / f"half-{frame}.ply"
+        write_points(seeds[frame], Points(points.xyz[kept], points.rgb[kept]))
+    holey = replace(whole, seeds=seeds)
+    psnr = {}
+    for times in (0, 3):
+        config = TrainConfig(iterations=300, guided=GuidedConfig(times=times, patch=8))
+        trainer = Trainer(holey, config, get_backend())
+        trainer.run(lambda progress: None)
+        assert len(trainer.guided_at) == times
+        psnr[times] = heldout_psnr(trainer, holey)
+    assert psnr[3] > psnr[0] + 0.7
