@@ -265,7 +265,7 @@ def write_segments(
         up=up,
         background=background,
         decoder_output=outputs[0] if outputs else None,
-        viewpoint=viewpoint,
+        viewpoint=viewpoint if outputs else None,
         files=files or {},
         provenance=provenance or {},
     )

@@ -10,37 +10,40 @@ import tyro
 from ..capture import CaptureOptions, read_capture
 from ..capture.layouts import find_layout
 from ..capture.media import media_path
+from ..gaussians.decoder import Activation, decoder_path
 from ..reel import Loaded, load_gaussians
 
 
 def run(
     file: tyro.conf.Positional[Path],
     /,
+    decoder_output: Activation | None = None,
     as_json: Annotated[bool, tyro.conf.arg(name="json")] = False,
     options: Annotated[CaptureOptions, tyro.conf.arg(name="")] = CaptureOptions(),  # noqa: B008
 ) -> None:
     """Say what a file holds, and what is unusual or wrong.
 
     Args:
-        file: a .reel, .ply or .splatv, or a capture (a folder in any layout, or a transforms.json).
+        file: a .reel, .ply, .stgc or .splatv, or a capture (a folder in any layout, or a transforms.json).
+        decoder_output: what the decoder of a bare full model (.ply with a .pt beside it) ends in; sigmoid without it.
         as_json: print JSON for programs to read.
         options: how a capture is read.
     """
-    facts = describe(file, options)
+    facts = describe(file, options, decoder_output)
     print(json.dumps(facts, indent=1, allow_nan=False) if as_json else table(facts))
 
 
-def describe(path: Path, options: CaptureOptions) -> dict[str, Any]:
+def describe(path: Path, options: CaptureOptions, decoder_output: Activation | None = None) -> dict[str, Any]:
     """Return the facts about one file, ready for JSON; `problems` lists sentences."""
     if path.is_dir() or path.suffix.lower() == ".json":
         return describe_capture(path, options)
-    loaded = load_gaussians(path)
+    loaded = load_gaussians(path, decoder_output=decoder_output)
     return describe_reel(loaded) if loaded.reel else describe_gaussians(loaded)
 
 
 def describe_gaussians(loaded: Loaded) -> dict[str, Any]:
-    """Return the facts about one payload of Gaussians."""
-    gaussians = loaded.gaussians
+    """Return the facts about one payload of Gaussians, and its decoder."""
+    gaussians, files = loaded.gaussians, _files(loaded)
     box = gaussians.bounds()
     lives = gaussians.lifetimes()
     visible = [len(gaussians.evaluate(time).alive) for time in (0.0, 0.5, 0.98)]
@@ -54,10 +57,28 @@ def describe_gaussians(loaded: Loaded) -> dict[str, Any]:
         "temporal centers": [float(gaussians.trbf_centers.min()), float(gaussians.trbf_centers.max())],
         "bounds": None if box is None else box.tolist(),
         "up": loaded.up,
+        "decoder": _decoder(loaded),
         "bytes in memory": sum(array.nbytes for array in vars(gaussians).values()),
-        "bytes on disk": loaded.path.stat().st_size,
+        "bytes on disk": sum(path.stat().st_size for path in files),
         "problems": [*loaded.report, *gaussians.problems()],
     }
+
+
+def _decoder(loaded: Loaded) -> str:
+    if loaded.gaussians.variant == "lite":
+        return "none, a lite model has its colors"
+    if loaded.decoder is None:
+        return "none, the base color stands for the color"
+    return f"per pixel, output activation {loaded.decoder.activation}"
+
+
+def _files(loaded: Loaded) -> list[Path]:
+    """The payload that was loaded, and its decoder if it has one."""
+    reel = loaded.reel
+    payload = reel.payload(reel.locate(loaded.frame_start)[0]) if reel else loaded.path
+    if loaded.decoder is None:
+        return [payload]
+    return [payload, next(path for path in (decoder_path(payload), payload.with_suffix(".pt")) if path.is_file())]
 
 
 def describe_reel(first: Loaded) -> dict[str, Any]:
@@ -69,7 +90,11 @@ def describe_reel(first: Loaded) -> dict[str, Any]:
     problems = [(part.pop("problems"), segment.file) for part, segment in zip(parts, reel.segments, strict=True)]
     return parts[0] | {
         "what": f"a reel of {reel.variant} Spacetime Gaussians",
-        "segments": [f"{s.file}: {s.frame_count} frames from {s.frame_start}" for s in reel.segments],
+        "segments": [
+            f"{segment.file}: {segment.frame_count} frames from {segment.frame_start}, "
+            f"{part['gaussians']:,} Gaussians, {part['bytes on disk']:,} bytes"
+            for segment, part in zip(reel.segments, parts, strict=True)
+        ],
         "gaussians": sum(part["gaussians"] for part in parts),
         "frames": f"{reel.frame_count} from frame {reel.frame_start} at {reel.fps:g} fps",
         "bounds": reel.bounds,
@@ -77,8 +102,7 @@ def describe_reel(first: Loaded) -> dict[str, Any]:
         "background": reel.background,
         "files": reel.files,
         "bytes in memory": sum(part["bytes in memory"] for part in parts),
-        "bytes on disk": reel.path.stat().st_size
-        + sum(reel.payload(index).stat().st_size for index in range(len(reel.segments))),
+        "bytes on disk": reel.path.stat().st_size + sum(part["bytes on disk"] for part in parts),
         "problems": [f"{file}: {sentence}" for sentences, file in problems for sentence in sentences],
     }
 

@@ -272,9 +272,17 @@ def _write_result(capture: Capture, config: TrainConfig, finished: list[_Finishe
         frame_start=capture.frame_start,
         up="Z",
         background=config.background,
+        viewpoint=_middle_of(capture),
         files={"config": paths.record.name},
         provenance={"capture": name, "iterations": config.iterations},
     )
+
+
+def _middle_of(capture: Capture) -> tuple[float, float, float]:
+    """Return where the training camera stands that is nearest to the mean of all."""
+    centers = np.stack([capture.cameras[name].center for name in capture.camera_names("train")])
+    x, y, z = centers[np.linalg.norm(centers - centers.mean(axis=0), axis=1).argmin()].tolist()
+    return x, y, z
 
 
 def _record(capture: Capture, config: TrainConfig, finished: list[_Finished], name: str) -> dict[str, object]:

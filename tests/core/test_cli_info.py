@@ -6,7 +6,9 @@ import json
 import numpy as np
 import pytest
 from holoreel.core.cli import main
+from holoreel.core.gaussians.decoder import Decoder, write_pt
 from holoreel.core.gaussians.ply import write_ply
+from holoreel.core.reel import SegmentPayload, write_segments
 
 
 def info(path, capsys) -> dict:
@@ -39,6 +41,31 @@ def test_a_ply_with_problems(tmp_path, random_model, capsys):
     said = " ".join(facts["problems"])
     for words in ("1 row of 20 left out", "1 row with zero quat", "decoder", "50 frames at 30 fps are assumed"):
         assert words in said
+
+
+def test_a_full_reel_of_segments(tmp_path, random_model, capsys):
+    decoder = Decoder(np.zeros((6, 12)), np.zeros((3, 6)), "clamp")
+    parts = [SegmentPayload(random_model(20 + i, i, features=9), decoder, 5 * i, 5) for i in range(2)]
+    write_segments(tmp_path / "a.reel", parts, fps=24, frame_start=0, suffix=".stgc")
+    facts = info(tmp_path / "a.reel", capsys)
+    assert facts["what"] == "a reel of full Spacetime Gaussians"
+    assert facts["decoder"] == "per pixel, output activation clamp"
+    assert facts["gaussians"] == 41
+    assert facts["bytes on disk"] == sum(path.stat().st_size for path in tmp_path.iterdir())
+    size = sum((tmp_path / f"a.001{suffix}").stat().st_size for suffix in (".stgc", ".decoder.safetensors"))
+    assert facts["segments"][1] == f"a.001.stgc: 5 frames from 5, 21 Gaussians, {size:,} bytes"
+
+
+def test_the_activation_of_bare_files_can_be_said(tmp_path, random_model, capsys):
+    write_ply(tmp_path / "a.ply", random_model(5, features=9))
+    write_pt(tmp_path / "a.pt", Decoder(np.zeros((6, 12)), np.zeros((3, 6))))
+    facts = info(tmp_path / "a.ply", capsys)
+    assert facts["decoder"] == "per pixel, output activation sigmoid"
+    assert any("a sigmoid is assumed" in problem for problem in facts["problems"])
+    assert main(["info", str(tmp_path / "a.ply"), "--decoder-output", "none", "--json"]) == 0
+    facts = json.loads(capsys.readouterr().out)
+    assert facts["decoder"] == "per pixel, output activation none"
+    assert not any("sigmoid" in problem for problem in facts["problems"])
 
 
 def test_a_capture(recording, capsys):
