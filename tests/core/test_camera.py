@@ -3,6 +3,8 @@
 
 import json
 import math
+import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,6 +12,7 @@ import numpy as np
 import pytest
 from holoreel.core.camera import Camera, focal_from_fov, read_camera, write_camera
 from holoreel.core.errors import HoloreelError
+from holoreel.core.lens import brown_limit, fisheye_limit
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -57,6 +60,141 @@ def test_project_undoes_unproject_and_rays_hit(camera: Camera, seed: int) -> Non
     homogeneous = np.concatenate([points, np.ones((30, 1))], 1) @ camera.world_to_camera.T
     expected = homogeneous[:, :3] @ camera.K.T
     assert np.allclose(expected[:, :2] / expected[:, 2:], uv, atol=1e-6)
+
+
+def lens(model: str, distortion: tuple[float, ...], width: int = 640, height: int = 480) -> Camera:
+    view = Camera.look_at((1, -4, 1), (0.2, 0, 0), width=width, height=height, fx=0.55 * width)
+    return replace(view, cx=0.47 * width, cy=0.54 * height, model=model, distortion=distortion)
+
+
+@st.composite
+def lenses(draw: st.DrawFn) -> Camera:
+    """What calibrations find: mild and strong, barrel and cushion, with and without tangential parts."""
+    model = draw(st.sampled_from(["OPENCV", "FULL_OPENCV", "OPENCV_FISHEYE"]))
+    first, others, tangential = st.floats(-0.5, 0.5), st.floats(-0.2, 0.2), st.floats(-0.02, 0.02)
+    if model == "OPENCV_FISHEYE":
+        return lens(model, tuple(draw(st.tuples(st.floats(-0.1, 0.2), *[st.floats(-0.05, 0.05)] * 3))))
+    values = draw(st.tuples(first, others, tangential, tangential))
+    return lens(model, values if model == "OPENCV" else (*values, *draw(st.tuples(others, first, others, others))))
+
+
+@given(lenses(), st.integers(0, 2**32 - 1))
+@settings(max_examples=100, deadline=None)
+def test_lenses_are_invertible_where_they_see(camera: Camera, seed: int) -> None:
+    """Pixels to points and back to 1e-9 px; what a lens sees it sees at one pixel, and that pixel sees it."""
+    rng = np.random.default_rng(seed)
+    uv = rng.uniform(-0.2, 1.2, (200, 2)) * (camera.width, camera.height)
+    _, rays = camera.rays(uv)
+    seen = np.isfinite(rays).all(axis=1)
+    assert seen[np.linalg.norm(uv - (camera.cx, camera.cy), axis=1) < 40].all()
+    z = rng.uniform(0.1, 50, 200)
+    points = camera.unproject(uv, z)
+    ahead = np.isfinite(points).all(axis=1)
+    assert not (ahead & ~seen).any()
+    back, depth = camera.project(points[ahead])
+    assert np.abs(back - uv[ahead]).max(initial=0) < 1e-9
+    assert np.allclose(depth, z[ahead])
+    back, _ = camera.project(camera.center + rays[seen] * z[seen, None])
+    assert np.abs(back - uv[seen]).max() < 1e-8
+    # From points: only those within the lens's range get pixels, and those pixels lead back to them.
+    local = np.concatenate([rng.uniform(-3, 3, (200, 2)), rng.uniform(-1, 1, (200, 1))], axis=1)
+    world = local @ camera.world_to_camera[:3, :3] + camera.center
+    uv, depth = camera.project(world)
+    has_pixel = np.isfinite(uv).all(axis=1)
+    if camera.model == "OPENCV_FISHEYE":
+        inside = np.arctan2(np.hypot(*local.T[:2]), local[:, 2]) < fisheye_limit(camera.distortion)
+        near_limit = 0.999 * fisheye_limit(camera.distortion)
+        well_inside = np.arctan2(np.hypot(*local.T[:2]), local[:, 2]) < near_limit
+    else:
+        slope = np.hypot(*local.T[:2]) / local[:, 2]
+        inside = (local[:, 2] > 0) & (slope < brown_limit(camera.distortion))
+        well_inside = inside & (slope < 0.98 * brown_limit(camera.distortion))
+    assert np.array_equal(has_pixel, inside)
+    _, rays = camera.rays(uv[well_inside])
+    assert np.isfinite(rays).all()
+    truth = (world - camera.center)[well_inside]
+    truth /= np.linalg.norm(truth, axis=1, keepdims=True)
+    pixels, _ = camera.project(camera.center + rays)
+    assert np.abs(pixels - uv[well_inside]).max(initial=0) < 1e-8 * (1 + np.abs(uv[well_inside]).max(initial=0))
+    assert (np.linalg.norm(rays - truth, axis=1) < 1e-4).all()  # near the limit pixels say little about angles
+
+
+def test_a_fold_is_not_seen() -> None:
+    """A lens that turns back: points beyond the turn would land in the picture again."""
+    camera = Camera(640, 480, 300, 300, 320, 240, model="OPENCV", distortion=(-0.3, 0, 0, 0))
+    limit = 1 / math.sqrt(0.9)  # of r (1 - 0.3 r²)
+    assert math.isclose(brown_limit(camera.distortion), limit)
+    slopes = np.array([0.5 * limit, 0.999 * limit, 1.001 * limit, 1.5 * limit])
+    uv, _ = camera.project(np.stack([slopes, np.zeros(4), np.ones(4)], axis=1))
+    assert np.isfinite(uv).all(axis=1).tolist() == [True, True, False, False]
+    _, rays = camera.rays([[320 + 300 * limit * (1 - 0.3 * limit**2) + 1, 240], [320, 240]])
+    assert np.isfinite(rays).all(axis=1).tolist() == [False, True]
+    fisheye = Camera(640, 480, 300, 300, 320, 240, model="OPENCV_FISHEYE", distortion=(0, 0, 0, 0))
+    behind = np.array([[1.0, 0, -0.5]])
+    uv, z = fisheye.project(behind)
+    assert np.allclose(uv, [[320 + 300 * math.atan2(1, -0.5), 240]])
+    assert z[0] < 0
+    assert np.allclose(fisheye.rays(uv)[1], behind / np.linalg.norm(behind))
+    assert np.isnan(fisheye.unproject(uv, [1.0])).all()
+    assert np.allclose(fisheye.project([[0, 0, 2.0]])[0], [[320, 240]])
+    assert np.isnan(fisheye.project([[0, 0, -2.0], [0, 0, 0]])[0]).all()
+
+
+COLMAP = """
+import json, sys
+import numpy as np, pycolmap
+answers = []
+for model, width, height, params, points in json.load(sys.stdin):
+    camera = pycolmap.Camera(model=model, width=width, height=height, params=params)
+    pixels = camera.img_from_cam(np.array(points))
+    answers.append([pixels.tolist(), camera.cam_from_img(pixels).tolist()])
+json.dump(answers, sys.stdout)
+"""
+
+
+def test_agrees_with_colmap() -> None:
+    """Their own code, in a process of its own: it does not get along with other libraries."""
+    cases = [
+        lens("PINHOLE", ()), lens("OPENCV", (-0.28, 0.07, 0.001, -0.002)), lens("OPENCV", (0.2, 0.05, 0.01, 0.02)),
+        lens("FULL_OPENCV", (0.5, 0.1, 0.001, -0.002, 0.02, 0.8, 0.2, 0.03)),
+        lens("OPENCV_FISHEYE", (0.05, -0.01, 0.002, -0.003)), lens("OPENCV_FISHEYE", (-0.03, 0.01, 0.0, 0.0)),
+    ]  # fmt: skip
+    rng = np.random.default_rng(0)
+    points = np.concatenate([rng.uniform(-0.9, 0.9, (60, 2)), np.ones((60, 1))], axis=1) * rng.uniform(0.5, 5, (60, 1))
+    questions = [(c.model, c.width, c.height, [c.fx, c.fy, c.cx, c.cy, *c.distortion], points.tolist()) for c in cases]
+    run = subprocess.run(
+        [sys.executable, "-c", COLMAP], input=json.dumps(questions), capture_output=True, text=True, check=True
+    )
+    for camera, (pixels, planes) in zip(cases, json.loads(run.stdout), strict=True):
+        world = points @ camera.world_to_camera[:3, :3] + camera.center
+        assert np.allclose(camera.project(world)[0], pixels, atol=1e-9, rtol=0)
+        local = (camera.unproject(pixels, np.ones(60)) - camera.center) @ camera.world_to_camera[:3, :3].T
+        assert np.allclose(local[:, :2], planes, atol=1e-6)  # they iterate to less
+        assert np.allclose(local, points / points[:, 2:], atol=1e-10)
+
+
+def test_distortion_must_suit_the_model(tmp_path: Path) -> None:
+    path = tmp_path / "CAMERA.json"
+    write_camera(path, lens("OPENCV", (0.1, 0.2, 0.3, 0.4)))
+    good = json.loads(path.read_text())
+    assert good["distortion"] == [0.1, 0.2, 0.3, 0.4]
+    assert read_camera(path).distortion == (0.1, 0.2, 0.3, 0.4)
+    assert read_camera(path).scaled(320, 240).distortion == (0.1, 0.2, 0.3, 0.4)
+    for wrong in ([], [0.1], [0.1] * 5, [0.1, 0.2, 0.3, "a"], [0.1, 0.2, 0.3, 1e300], "abcd", None, {"k1": 1}):
+        path.write_text(json.dumps(good | {"distortion": wrong}))
+        with pytest.raises(HoloreelError, match=r"CAMERA\.json.*distortion of a OPENCV camera must be 4 numbers"):
+            read_camera(path)
+    path.write_text(json.dumps(good | {"model": "PINHOLE"}))
+    with pytest.raises(HoloreelError, match="distortion is not a field of a PINHOLE camera"):
+        read_camera(path)
+    with pytest.raises(HoloreelError, match="Blender knows PINHOLE alone"):
+        lens("OPENCV", (0.1, 0.2, 0.3, 0.4)).require_pinhole("Blender")
+
+
+def test_scaled_lenses_see_the_same() -> None:
+    camera = lens("OPENCV_FISHEYE", (0.05, -0.01, 0.002, -0.003))
+    points = camera.unproject([[100.0, 50.0], [600.0, 400.0]], [2.0, 3.0])
+    assert np.allclose(camera.scaled(1280, 240).project(points)[0], camera.project(points)[0] * (2, 0.5))
 
 
 @given(cameras())
@@ -159,7 +297,8 @@ def test_camera_file(tmp_path: Path) -> None:
     assert np.array_equal(read_camera(path).world_to_camera, camera.world_to_camera)
     good = json.loads(path.read_text())
     for change, field in [
-        ({"model": "FOV"}, "model"), ({"model": "OPENCV"}, "distortion is missing"), ({"fx": -1}, "fx"), ({"k1": 0.1}, "k1"), ({"world_to_camera": [[1]]}, "world"),
+        ({"model": "FOV"}, "model"), ({"model": "OPENCV"}, "distortion is missing"),
+        ({"fx": -1}, "fx"), ({"k1": 0.1}, "k1"), ({"world_to_camera": [[1]]}, "world"),
     ]:  # fmt: skip
         path.write_text(json.dumps(good | change))
         with pytest.raises(HoloreelError, match=rf"CAMERA\.json.*{field}"):

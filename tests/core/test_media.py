@@ -1,15 +1,26 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Videos read by frame: every codec's frames are the right ones, colors are right, and what is no video is refused."""
+"""Videos read by frame, and the stream of pictures that trains on them.
 
+Every codec's frames are the right ones, colors are right, what is no video is refused. The stream draws every view
+equally often, the same sequence however slow reading is, in little memory.
+"""
+
+import gc
+import threading
+import time
+from collections import Counter
 from pathlib import Path
 
 import av
+import imageio.v3 as imageio
 import numpy as np
 import pytest
 from holoreel.core.camera import Camera
-from holoreel.core.capture import Capture
+from holoreel.core.capture import Capture, View
+from holoreel.core.capture import capture as capture_module
 from holoreel.core.capture import media as media_module
 from holoreel.core.capture.media import VideoFrame, iterate, keyframes, probe, read_frame
+from holoreel.core.capture.stream import PictureStream
 from holoreel.core.errors import HoloreelError
 
 FRAMES, WIDTH, HEIGHT = 30, 48, 32
@@ -173,3 +184,154 @@ def test_damage_inside_never_shifts_frames(tmp_path: Path) -> None:
         read_frame(VideoFrame(path, 12))
     others = [frame for frame in range(FRAMES) if frame != 12]
     assert [numbers(read_frame(VideoFrame(path, frame)))[1] for frame in others] == others
+
+
+CAMERAS = 4
+BYTES = 3 * WIDTH * HEIGHT
+NUMBER = {f"cam{index}": index for index in range(CAMERAS)}
+
+
+@pytest.fixture(scope="module")
+def videos(tmp_path_factory: pytest.TempPathFactory) -> Capture:
+    """Four cameras, 30 frames; two videos with keyframes far apart, two with near ones."""
+    folder = tmp_path_factory.mktemp("videos")
+    images, cameras = {}, {}
+    for name, index in NUMBER.items():
+        path = write_video(folder / f"{name}.mp4", "libx264", "yuv444p", index, gop=(15, 3)[index % 2], crf="0")
+        cameras[name] = Camera(WIDTH, HEIGHT, 40, 40, 24, 16, name=name)
+        images |= {(name, j): VideoFrame(path, j) for j in range(FRAMES)}
+    return Capture(cameras, images, FRAMES)
+
+
+def draw(stream: PictureStream, count: int) -> list[View]:
+    """Draw views, checking that every picture is its view's."""
+    views = []
+    for _ in range(count):
+        view, picture = stream.next()
+        assert numbers(picture) == (NUMBER[view[0]], view[1])
+        assert picture.dtype == np.uint8
+        views.append(view)
+    return views
+
+
+def test_what_fits_is_permuted(videos: Capture, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each pass has every view once, and no picture is read twice."""
+    read: Counter[object] = Counter()
+    before = capture_module.read_frame
+    monkeypatch.setattr(capture_module, "read_frame", lambda frame: read.update([frame]) or before(frame))
+    views = videos.views()
+    with PictureStream(videos, views, seed=3, limit_bytes=BYTES * len(views)) as stream:
+        passes = [draw(stream, len(views)) for _ in range(3)]
+    assert all(sorted(part) == sorted(views) for part in passes)
+    assert passes[0] != passes[1] != passes[2] != views
+    assert set(read.values()) == {1}
+    # Permutations without a pattern: neighbors in time are not neighbors in the sequence.
+    steps = [abs(a[1] - b[1]) for a, b in zip(passes[1], passes[1][1:], strict=False)]
+    assert 7 < np.mean(steps) < 13
+
+
+def test_what_does_not_fit_is_shuffled_in_a_window(videos: Capture, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Equally often in the long run, never more than the limit in memory, and mostly decoded in sequence."""
+    views, decoded = videos.views(), 0
+    before = media_module._Decoder._jump
+    jumps = []
+    monkeypatch.setattr(media_module._Decoder, "_jump", lambda self, pts: jumps.append(pts) or before(self, pts))
+    with PictureStream(videos, views, seed=3, limit_bytes=40 * BYTES) as stream:
+        drawn = []
+        for _ in range(10 * len(views)):
+            drawn += draw(stream, 1)
+            assert stream._shelf is not None
+            assert len(stream._shelf._pictures) <= 40
+            decoded += 1
+    counts = Counter(drawn)
+    assert set(counts) == set(views)
+    assert 8 <= min(counts.values()) <= max(counts.values()) <= 12
+    assert len(jumps) < decoded / 2
+    cameras = [NUMBER[name] for name, _ in drawn[200:]]
+    assert np.mean(np.diff(cameras) == 0) < 0.45  # 0.25 without any order
+    steps = np.abs(np.diff([frame for _, frame in drawn[200:]]))
+    assert steps.mean() > 7  # 10 without any order
+
+
+@pytest.mark.parametrize("limit", [10, 40, 1000])
+def test_the_seed_alone_decides(videos: Capture, limit: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    views = videos.views()
+
+    def sequence(seed: int) -> list[View]:
+        with PictureStream(videos, views, seed=seed, limit_bytes=limit * BYTES) as stream:
+            return draw(stream, 150)
+
+    quick = sequence(1)
+    before = Capture.image
+    slow = np.random.default_rng(0)
+
+    def late(*args: object, **kwargs: object) -> np.ndarray:
+        time.sleep(slow.uniform(0, 0.004))
+        return before(*args, **kwargs)
+
+    monkeypatch.setattr(Capture, "image", late)
+    assert sequence(1) == quick
+    assert sequence(2) != quick
+
+
+@pytest.mark.parametrize("limit", [10, 40, 1000])
+@pytest.mark.parametrize("after", [0, 1, 70, 300])
+def test_a_state_goes_on(videos: Capture, limit: int, after: int) -> None:
+    arguments = {"views": videos.views(), "seed": 5, "limit_bytes": limit * BYTES}
+    with PictureStream(videos, **arguments) as stream:
+        draw(stream, after)
+        state = stream.state()
+        expected = draw(stream, 130)
+    with PictureStream(videos, **arguments) as stream:
+        stream.load_state(state)
+        assert draw(stream, 130) == expected
+        stream.load_state(state)
+        assert draw(stream, 30) == expected[:30]
+    with PictureStream(videos, videos.views(), seed=5, limit_bytes=20 * BYTES) as other:
+        other.load_state(state)
+        assert len(draw(other, 50)) == 50
+
+
+def test_no_thread_is_left(videos: Capture) -> None:
+    others = set(threading.enumerate())
+
+    def threads() -> list[str]:
+        return [thread.name for thread in threading.enumerate() if thread not in others]
+
+    stream = PictureStream(videos, videos.views(), limit_bytes=20 * BYTES)
+    assert threads() == []
+    first = draw(stream, 3)
+    assert threads() == ["holoreel pictures"]
+    stream.close()
+    assert threads() == []
+    stream.close()
+    again = PictureStream(videos, videos.views(), limit_bytes=20 * BYTES)
+    assert draw(again, 3) == first
+    assert len(threads()) == 1
+    del again
+    gc.collect()
+    assert threads() == []
+
+
+def test_files_with_alpha_and_errors(tmp_path: Path) -> None:
+    """PNGs over the background; a file that vanishes is named by the draw that needs it."""
+    images = {}
+    for frame in range(6):
+        images["a", frame] = tmp_path / f"{frame}.png"
+        imageio.imwrite(images["a", frame], np.full((4, 6, 4), (200, 100, 50, 51 * (frame % 2)), np.uint8))
+    capture = Capture({"a": Camera(6, 4, 5, 5, 3, 2)}, images, 6)
+    with PictureStream(capture, capture.views(), (1.0, 0.0, 0.0)) as stream:
+        for _ in range(12):
+            view, picture = stream.next()
+            assert picture.shape == (4, 6, 3)
+            assert picture[0, 0].tolist() == ([244, 20, 10] if view[1] % 2 else [255, 0, 0])
+    images["a", 4].unlink()
+    with PictureStream(capture, capture.views()) as stream, pytest.raises(HoloreelError, match=r"4\.png"):
+        [stream.next() for _ in range(7)]
+    with pytest.raises(HoloreelError, match="no pictures"):
+        PictureStream(capture, [])
+    monkey = pytest.MonkeyPatch()
+    with monkey.context() as patch, PictureStream(capture, capture.views()) as stream:
+        patch.setattr(Capture, "image", lambda *_args, **_kwargs: 1 // 0)
+        with pytest.raises(HoloreelError, match="ZeroDivisionError"):
+            stream.next()
