@@ -74,7 +74,8 @@ def read_result(folder: str | Path) -> SfmResult:
         by_name[camera.name] = camera
     if meta.get("posed") not in ("sfm", "capture"):
         raise _broken(path, "posed must be 'sfm' or 'capture'")
-    start, count = meta.get("frame_start"), meta.get("frame_count")
+    start: Any = meta.get("frame_start")
+    count: Any = meta.get("frame_count")
     if not _whole(start) or not _whole(count) or not 1 <= count <= MAX_FRAMES:
         raise _broken(path, "frame_start and frame_count must be whole numbers")
     points = _points(path, meta.get("frames"), count)

@@ -18,7 +18,8 @@ from ..camera import Camera
 from ..errors import HoloreelError
 from .jobs import Found
 
-Members = tuple[int, int] | tuple[int, int, int]
+Triple = tuple[int, int, int]
+Members = tuple[int, int] | Triple
 Array = NDArray[np.float64]
 
 MIN_PIXELS = 1.5
@@ -230,7 +231,7 @@ def _partners(matches: NDArray[np.int64], count: int) -> NDArray[np.int64]:
     return partners
 
 
-def _triples(partners: Mapping[tuple[int, int], NDArray[np.int64]], count: int) -> list[Members]:
+def _triples(partners: Mapping[tuple[int, int], NDArray[np.int64]], count: int) -> list[Triple]:
     """The triples of cameras that are matched with each other, or as many of them as there is time for."""
     triples = [
         (a, b, c)

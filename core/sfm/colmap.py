@@ -70,6 +70,8 @@ def reconstruct(job: dict[str, Any], emit: Emit) -> dict[str, Any]:
     """Find poses and lenses too; write the arrays above and return how many points there are."""
     database = _matched(job, emit)
     emit({"event": "stage", "stage": "poses"})
+    matches = _verified(job, database)
+    connected = {camera for pair in matches for camera in pair}
     best = None
     for attempt, angle in enumerate(_RELAXED_ANGLES_DEGREES):
         options = _mapper_options(job)
@@ -78,14 +80,14 @@ def reconstruct(job: dict[str, Any], emit: Emit) -> dict[str, Any]:
         if attempt:  # few cameras, far apart, have little in common
             options.mapper.init_min_num_inliers = 40
             options.mapper.abs_pose_min_num_inliers = 15
-        found = pycolmap.incremental_mapping(database, job["pictures"], _folder(job, f"out{attempt}"), options=options)
-        for model in found.values():
+        models = pycolmap.incremental_mapping(database, job["pictures"], _folder(job, f"out{attempt}"), options=options)
+        for model in models.values():
             if best is None or _rank(model) > _rank(best):
                 best = model
-        if best is not None and best.num_reg_images() == len(job["cameras"]):
+        if best is not None and best.num_reg_images() >= len(connected):
             break
     found = {} if best is None else _points(best) | _poses(best, job)
-    return _finish(job, database, _verified(job, database), found)
+    return _finish(job, database, matches, found)
 
 
 def _rank(model: pycolmap.Reconstruction) -> tuple[int, int]:
@@ -294,5 +296,5 @@ def _finish(
         for index in range(len(job["cameras"])):
             arrays[f"keypoints_{index}"] = database.read_keypoints(index + 1)[:, :2]
     with atomic_path(job["out"]) as temporary:
-        np.savez(temporary, **arrays)
+        np.savez(temporary, allow_pickle=False, **arrays)
     return {"points": len(arrays.get("xyz", ())), "pycolmap": pycolmap.__version__}

@@ -40,7 +40,7 @@ OnMessage = Callable[[str], None]
 
 TYPICAL_DISTANCE = 5.0
 _FOCAL_GUESS = 0.9  # of the longer side: 58 degrees
-_LEVEL_WEIGHT = 0.01  # how much the cameras' vertical axes count against their horizontal ones
+_LEVEL_WEIGHT = 1e-4  # how much the cameras' vertical axes count against their horizontal ones
 _PARAMETERS = {"SIMPLE_RADIAL": 4, "PINHOLE": 4, "OPENCV": 8, "OPENCV_FISHEYE": 8, "FULL_OPENCV": 12}
 
 
@@ -163,20 +163,18 @@ def _cameras(capture: Capture, names: Sequence[str], found: Found, lens: str) ->
             "--quality high; or calibrate the cameras."
         )
     cameras = []
-    for index in np.flatnonzero(registered):
+    for index in np.flatnonzero(registered).tolist():
         old = capture.cameras[names[index]]
         params = found.arrays["params"][index].tolist()
         if lens == "SIMPLE_RADIAL":
-            focal, cx, cy, k1 = params
-            model, params = "OPENCV", [focal, focal, cx, cy, k1, 0.0, 0.0, 0.0]
+            focal, *center, k1 = params
+            model, params = "OPENCV", [focal, focal, *center, k1, 0.0, 0.0, 0.0]
         else:
             model = lens
+        fx, fy, cx, cy, *distortion = params
         pose = found.arrays["poses"][index]
-        cameras.append(
-            Camera(
-                old.width, old.height, *params[:4], pose, model=model, name=names[index], distortion=tuple(params[4:])
-            )
-        )
+        camera = Camera(old.width, old.height, fx, fy, cx, cy, pose, model, names[index], tuple(distortion))
+        cameras.append(camera)
     return cameras
 
 

@@ -256,12 +256,12 @@ def test_held_out_views_stay_unseen(tmp_path: Path) -> None:
 def test_turned_cameras_are_refused_with_figures(room: tuple[Capture, SfmReport], tmp_path: Path) -> None:
     capture = room[0].frames(0, 1)
     believed = {name: turned(camera, 2) if name == "cam4" else camera for name, camera in capture.cameras.items()}
-    wrong = replace(capture, cameras=believed)
+    wrong = replace(capture, cameras=believed, splits={"cam0": "test", "cam1": "test"})
     with pytest.raises(HoloreelError, match=r"'cam4' misses .* by \d+\.\d px .* --without cam4\.") as refusal:
         run_sfm(wrong, tmp_path, LOW)
     assert str(refusal.value).count("cam") == 3  # the camera, the word, the remedy
     assert not (tmp_path / "sfm.json").exists()
-    assert run_sfm(wrong, tmp_path, replace(LOW, without=("cam4",))).frames[0].points > 600
+    assert run_sfm(wrong, tmp_path, replace(LOW, without=("cam4",))).frames[0].points > 300
 
 
 def test_pictures_without_features_are_refused(tmp_path: Path) -> None:
@@ -297,14 +297,14 @@ def _on_floor(camera: Camera) -> np.ndarray:
 
 def test_poses_are_found(tmp_path: Path) -> None:
     """Full structure from motion, against the truth up to a similarity; up must be up."""
-    cameras = room_cameras(5, size=(320, 240))
+    cameras = room_cameras(4, size=(320, 240))
     capture = room_capture(tmp_path, cameras, frames=2)
     blind = {camera.name: Camera(320, 240, 100, 100, 160, 120, name=camera.name) for camera in cameras}
     blind["blind"] = Camera(320, 240, 100, 100, 160, 120, name="blind")
     images = capture.images | {("blind", frame): tmp_path / "blind.png" for frame in range(2)}
     Image.new("RGB", (320, 240)).save(tmp_path / "blind.png")
     unposed = replace(capture, cameras=blind, images=images)
-    found = find_poses(unposed, LOW, PoseSettings(lens="PINHOLE", reference=(0, 1)))
+    found = find_poses(unposed, LOW, PoseSettings(reference=(0,)))
     assert [camera.name for camera in found.cameras] == [camera.name for camera in cameras]
     truth = np.array([camera.center for camera in cameras])
     result = np.array([camera.center for camera in found.cameras])
@@ -348,6 +348,7 @@ def test_command_line(
     assert "'cam1'" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_webcams(shared_data: Callable[[str], Path], tmp_path: Path) -> None:
     """Four real cameras far apart, whose calibration is good to about a pixel."""
     from holoreel.core.capture.layouts import read_capture
