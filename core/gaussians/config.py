@@ -166,6 +166,8 @@ class TrainConfig:
     """frames beyond its own on either side that a segment learns from too"""
     share_static: bool = True
     """let a segment begin with what stood still in the one before it, so that nothing jumps between them"""
+    inherited_pace: float = 0.1
+    """what a segment began with learns at this part of all rates"""
     max_seeds: int = 40_000
     """at most this many Gaussians to begin with"""
     seed_frames: int = 1

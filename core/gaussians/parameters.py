@@ -45,7 +45,8 @@ class Parameters:
     """Spacetime Gaussians as leaf tensors, a full model's network, and Adam's two moments for each of them.
 
     `measure` gives the unit of length at each mean, in which steps of positions and motions are counted; `units` (N,)
-    are the ones in use, `stats` what density control gathers: rows of both come and go with the Gaussians.
+    are the ones in use, `stats` what density control gathers, `paces` (N,) a factor of every row's steps (1 for all but
+    those that should stay about as they are): rows of all three come and go with the Gaussians.
     """
 
     def __init__(
@@ -62,6 +63,7 @@ class Parameters:
         self.steps = 0
         self.measure = measure
         self.units = measure(self.tensors["means"].detach())
+        self.paces = torch.ones(len(self))
         self.stats = empty_stats(len(self))
 
     def __len__(self) -> int:
@@ -97,6 +99,7 @@ class Parameters:
             self.first[name] = self.first[name][rows].clone()
             self.second[name] = self.second[name][rows].clone()
         self.units = self.units[rows].clone()
+        self.paces = self.paces[rows].clone()
         self.stats = DensityStats(*(getattr(self.stats, name)[rows].clone() for name in ROW_STATE))
 
     def append(self, rows: Mapping[str, Tensor]) -> None:
@@ -109,6 +112,7 @@ class Parameters:
         self.units = torch.cat([self.units, self.measure(rows["means"])])
         stats = [getattr(self.stats, name) for name in ROW_STATE]
         added = len(rows["means"])
+        self.paces = torch.cat([self.paces, torch.ones(added)])
         self.stats = DensityStats(*(torch.cat([value, value.new_zeros(added)]) for value in stats))
 
     def forget(self, rows: Tensor) -> None:
@@ -130,6 +134,7 @@ class Parameters:
             "second": self.second,
             "steps": self.steps,
             "units": self.units,
+            "paces": self.paces,
             "stats": {name: getattr(self.stats, name) for name in ROW_STATE},
         }
 
@@ -144,5 +149,6 @@ class Parameters:
         self.steps = int(state["steps"])
         self.measure = measure
         self.units = state["units"].clone()
+        self.paces = state["paces"].clone()
         self.stats = DensityStats(*(state["stats"][name].clone() for name in ROW_STATE))
         return self

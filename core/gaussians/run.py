@@ -120,7 +120,7 @@ def _trainer(
         return Trainer(part, config, backend)
     points = [part.seed_points(frame) for frame in range(part.frame_count)]
     seeds = warm_seeds(points, before.static, config, np.random.default_rng([config.seed, plan.index]))
-    return Trainer(part, config, backend, seeds=seeds, decoder=before.payload.decoder)
+    return Trainer(part, config, backend, seeds=seeds, decoder=before.payload.decoder, inherited=len(before.static))
 
 
 def _train_segment(

@@ -92,7 +92,8 @@ class Trainer:
     """One run: from a capture's seed points, or given Gaussians, to trained ones; resumable at any iteration.
 
     `seeds` are lite or full Gaussians to begin with instead of those made of the capture's points; for full ones,
-    `decoder` may be the network they were trained with.
+    `decoder` may be the network they were trained with. The first `inherited` of them have been trained before, and
+    learn at the pace `config.inherited_pace`.
     Raises `HoloreelError` where there is nothing to learn from or to begin with.
     """
 
@@ -103,6 +104,7 @@ class Trainer:
         backend: ModuleType,
         seeds: SpacetimeGaussians | None = None,
         decoder: Decoder | None = None,
+        inherited: int = 0,
     ):
         self.capture, self.config, self.backend = capture, config, backend
         self.views = capture.views("train")
@@ -130,6 +132,8 @@ class Trainer:
         if seeds is None:
             seeds = self._fitted(gaussians_from_points(points, config, np.random.default_rng(config.seed)))
         self.parameters = Parameters(as_trained(seeds, config), self._network(decoder), self.measure)
+        self.inherited = inherited
+        self.parameters.paces[:inherited] = config.inherited_pace
         self.pictures = PictureStream(capture, self.views, config.background, config.seed, config.picture_memory)
         control = DensityControl if config.strategy == "density" else McmcControl
         self.control: DensityControl | McmcControl = control(config, self.scene, self.times)
@@ -249,26 +253,28 @@ class Trainer:
 
     def _rates(self) -> dict[str, Rate]:
         """Return the learning rate of each tensor at this iteration."""
-        config, rates, units = self.config, self.config.rates, self.parameters.units
+        config, rates = self.config, self.config.rates
+        paces = self.parameters.paces if self.inherited else None
+        units = self.parameters.units if paces is None else self.parameters.units * paces
         decay = rates.final_factor ** (self.iteration / config.planned)
         orders = (torch.arange(9) // 3 < config.motion).to(torch.float32)
         if config.model == "lite":
-            colors = Rate(rates.features * decay, *((None, None, 0.0, 1.0) if config.clamp_colors else ()))
+            colors = Rate(rates.features * decay, paces, None, *((0.0, 1.0) if config.clamp_colors else ()))
         else:
-            colors = Rate(decay, None, torch.tensor([rates.features] * 6 + [rates.features_time] * 3))
+            colors = Rate(decay, paces, torch.tensor([rates.features] * 6 + [rates.features_time] * 3))
         inputs = torch.ones(SHAPES["hidden"][1])
         inputs[6:9] = self._origin_scale
         temporal = decay if config.temporal_opacity else 0.0
         return {
             "means": Rate(rates.means * self._pace(), units),
             "motions": Rate(rates.motions * decay if config.motion else 0.0, units, orders),
-            "quats": Rate(rates.quats * decay),
-            "omegas": Rate(rates.omegas * decay if config.rotation else 0.0),
-            "log_scales": Rate(rates.scales * decay),
-            "opacity_logits": Rate(rates.opacities * decay),
+            "quats": Rate(rates.quats * decay, paces),
+            "omegas": Rate(rates.omegas * decay if config.rotation else 0.0, paces),
+            "log_scales": Rate(rates.scales * decay, paces),
+            "opacity_logits": Rate(rates.opacities * decay, paces),
             "features": colors,
-            "trbf_centers": Rate(rates.trbf_centers * temporal),
-            "trbf_log_scales": Rate(rates.trbf_scales * temporal),
+            "trbf_centers": Rate(rates.trbf_centers * temporal, paces),
+            "trbf_log_scales": Rate(rates.trbf_scales * temporal, paces),
             "hidden": Rate(rates.decoder * decay, None, inputs),
             "output": Rate(rates.decoder * decay),
         }
