@@ -60,11 +60,6 @@ def score(image: ArrayLike, truth: ArrayLike, mask: ArrayLike | None = None) -> 
     )
 
 
-def mean_scores(scores: list[Scores]) -> Scores:
-    """Return the mean of each measure over pictures (decibels are averaged as such, like the paper's)."""
-    return Scores(*(float(value) for value in np.mean(scores, axis=0)))
-
-
 def _prepare(image: ArrayLike) -> NDArray[np.float64]:
     values = np.asarray(image, dtype=np.float64)
     if values.ndim != 3:

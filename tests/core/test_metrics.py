@@ -4,7 +4,7 @@
 import numpy as np
 import pytest
 from holoreel.core.errors import HoloreelError
-from holoreel.core.metrics import Scores, mean_scores, psnr, score, ssim
+from holoreel.core.metrics import psnr, score, ssim
 
 
 def ssim_by_definition(a: np.ndarray, b: np.ndarray, data_range: float) -> float:
@@ -75,9 +75,3 @@ def test_small_pictures_and_wrong_shapes_are_refused(pair):
         ssim(pair[0][:6], pair[1][:6])
     with pytest.raises(ValueError, match="H, W, C"):
         psnr(pair[0][:, :, 0], pair[1][:, :, 0])
-
-
-def test_means_are_per_picture():
-    assert mean_scores([Scores(30.0, 0.8, 0.1, 0.05), Scores(40.0, 1.0, 0.0, 0.0)]) == pytest.approx(
-        (35.0, 0.9, 0.05, 0.025)
-    )
