@@ -138,10 +138,11 @@ HOLOREEL_HEAVY_CLONES void project_chunk(const HoloreelGaussians& g, const View&
     visible = slots = 0;
     uint32_t alive[kChunk];
     int64_t count = 0;
+    const bool cull = g.spacetime && rules.cull_faded;
+    const double fade_limit = -log_alpha_min + 1e-6;
     for (int64_t first = begin; first < end; first += kRows) {
         const RowSet rows(first, end);
-        Instant instant;
-        const Mask seen = fade(g, rows, rules, instant);
+        const Mask seen = cull ? may_be_seen(g, rows, fade_limit) : ~Mask{};
         for (int lane = 0; lane < rows.count; lane++) {
             frame.footprints[first + lane].tiles = 0;
             alive[count] = static_cast<uint32_t>(first + lane);

@@ -40,17 +40,30 @@ inline D feature_poison(const HoloreelGaussians& g, const RowSet& rows) {
     return sum;
 }
 
-// Fills the opacity and what it is made of (Eq. 7); returns the lanes that can be seen. The others are under `alpha_min`, or
+// Fills u and what it is made of (Eq. 7).
+inline void time_basis(const HoloreelGaussians& g, const RowSet& rows, Instant& out) {
+    D center, log_width;
+    rows.load<1>(g.trbf_centers, &center);
+    rows.load<1>(g.trbf_log_scales, &log_width);
+    out.dt = g.time - center;
+    out.inverse_width = exp(-(log_width < all(kMinLogWidth) ? all(kMinLogWidth) : log_width));
+    out.u = out.dt * out.inverse_width;
+}
+
+// The lanes that may be seen at this time: where even a wholly opaque Gaussian has not faded under `alpha_min`. All that
+// `evaluate` lets through is among them; what is not costs nothing beyond this.
+inline Mask may_be_seen(const HoloreelGaussians& g, const RowSet& rows, double fade_limit) {
+    Instant instant;
+    time_basis(g, rows, instant);
+    return instant.u * instant.u <= all(fade_limit);
+}
+
+// Fills the opacity and what it is made of; returns the lanes that can be seen. The others are under `alpha_min`, or
 // without `cull_faded` zero; a NaN is never seen.
 inline Mask fade(const HoloreelGaussians& g, const RowSet& rows, const HoloreelRules& rules, Instant& out) {
     rows.load<1>(g.opacities, &out.opacity);
     if (g.spacetime) {
-        D center, log_width;
-        rows.load<1>(g.trbf_centers, &center);
-        rows.load<1>(g.trbf_log_scales, &log_width);
-        out.dt = g.time - center;
-        out.inverse_width = exp(-(log_width < all(kMinLogWidth) ? all(kMinLogWidth) : log_width));
-        out.u = out.dt * out.inverse_width;
+        time_basis(g, rows, out);
         out.temporal = exp(-out.u * out.u);
         out.occupancy = 1.0 / (1.0 + exp(-out.opacity));
         out.opacity = out.occupancy * out.temporal;
