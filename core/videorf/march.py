@@ -87,40 +87,56 @@ def _c_rays(rays: Rays, rules: MarchRules) -> CRays:
     return CRays(len(rays.origins), *pointers, rules.step, rules.transmittance_min)
 
 
-def _forward(volume: Volume, rays: Rays, rules: MarchRules, table: Tensor) -> tuple[Tensor, Tensor, int]:
+class _Tape:
+    """What the kernels wrote down on the way forth."""
+
+    def __init__(self, volume: Volume, handle: int) -> None:
+        self.volume, self.handle = volume, handle
+
+    def __del__(self) -> None:
+        self.volume.library.videorf_tape_free(self.handle)
+
+
+def _forward(
+    volume: Volume, rays: Rays, rules: MarchRules, table: Tensor, with_tape: bool = False
+) -> tuple[Tensor, Tensor, int, _Tape | None]:
     accumulated = torch.empty(len(rays.origins), table.shape[1])
     depth = torch.empty(len(rays.origins))
     images = CImages(_address(accumulated), _address(depth))
-    samples = ctypes.c_int64()
-    arguments = volume.handle, _address(table), table.shape[1], _c_rays(rays, rules), images, samples
-    if volume.library.videorf_forward(*arguments) != 0:
+    samples, tape = ctypes.c_int64(), ctypes.c_void_p()
+    status = volume.library.videorf_forward(
+        volume.handle,
+        _address(table),
+        table.shape[1],
+        _c_rays(rays, rules),
+        images,
+        samples,
+        tape if with_tape else None,
+    )
+    if status != 0:
         raise HoloreelError(f"The rays cannot be marched: {volume.library.videorf_last_error().decode()}.")
-    return accumulated, depth, samples.value
+    return accumulated, depth, samples.value, _Tape(volume, tape.value) if tape.value else None
 
 
 class _March(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, volume: Volume, rays: Rays, rules: MarchRules, table: Tensor) -> tuple[Tensor, Tensor]:
-        ctx.volume, ctx.rays, ctx.rules = volume, rays, rules
-        ctx.save_for_backward(table)
+        accumulated, depth, _, tape = _forward(volume, rays, rules, table, ctx.needs_input_grad[3])
+        ctx.tape, ctx.shape = tape, table.shape
         ctx.set_materialize_grads(False)
-        return _forward(volume, rays, rules, table)[:2]
+        return accumulated, depth
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, *gradients: Tensor | None) -> tuple[Tensor | None, ...]:
-        (table,) = ctx.saved_tensors
+        if ctx.tape is None:
+            raise RuntimeError("the gradient of a march can be taken once: march again")
+        tape, ctx.tape = ctx.tape, None
         accumulated, depth = (None if gradient is None else _plain(gradient) for gradient in gradients)
-        gradient = torch.empty_like(table)
-        status = ctx.volume.library.videorf_backward(
-            ctx.volume.handle,
-            _address(table),
-            table.shape[1],
-            _c_rays(ctx.rays, ctx.rules),
-            CImages(_address(accumulated), _address(depth)),
-            _address(gradient),
-        )
-        if status != 0:
-            reason = ctx.volume.library.videorf_last_error().decode()
+        gradient = torch.empty(ctx.shape)
+        images = CImages(_address(accumulated), _address(depth))
+        library = tape.volume.library
+        if library.videorf_backward(tape.handle, images, _address(gradient)) != 0:
+            reason = library.videorf_last_error().decode()
             raise HoloreelError(f"The gradient of the rays cannot be computed: {reason}.")
         return None, None, None, gradient

@@ -11,7 +11,7 @@ from pathlib import Path
 from ..errors import HoloreelError
 from ..render.native import available_cores
 
-ABI = 1  # VIDEORF_ABI in kernels/api.hpp
+ABI = 2  # VIDEORF_ABI in kernels/api.hpp
 
 
 class CLattice(Structure):
@@ -54,9 +54,10 @@ _SIGNATURES = {
     "videorf_volume_cells": (c_int64, (c_void_p,)),
     "videorf_forward": (
         c_int,
-        (c_void_p, c_void_p, c_int32, POINTER(CRays), POINTER(CImages), POINTER(c_int64)),
+        (c_void_p, c_void_p, c_int32, POINTER(CRays), POINTER(CImages), POINTER(c_int64), POINTER(c_void_p)),
     ),
-    "videorf_backward": (c_int, (c_void_p, c_void_p, c_int32, POINTER(CRays), POINTER(CImages), c_void_p)),
+    "videorf_backward": (c_int, (c_void_p, POINTER(CImages), c_void_p)),
+    "videorf_tape_free": (None, (c_void_p,)),
 }
 
 

@@ -248,6 +248,22 @@ def test_wrong_arguments_are_refused():
         native.set_lanes(7)
 
 
+def test_a_gradient_is_taken_once_and_tapes_are_used_again():
+    field = ball_field()
+    volume, rays = Volume(field), random_rays(field, 200)
+    gradients = []
+    for _ in range(4):
+        table = random_table(field, 8).float().requires_grad_()
+        loss = march(volume, table, rays).features.sum()
+        other = march(volume, table.detach().flip(0).requires_grad_(), rays).features.sum()  # another tape, in between
+        loss.backward(retain_graph=True)
+        gradients.append(table.grad.clone())
+        other.backward()
+        with pytest.raises(RuntimeError, match="once"):
+            loss.backward()
+    assert all((gradient == gradients[0]).all() for gradient in gradients)
+
+
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="needs fork")
 def test_march_works_in_a_forked_child():
     field = ball_field()

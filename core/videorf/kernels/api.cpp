@@ -17,10 +17,9 @@ namespace videorf {
 
 namespace {
 
-constexpr int64_t kRun = 64;            // rays a task marches
-constexpr int64_t kSlabRuns = 256;      // runs whose records are kept at once: about 25 MB
-std::mutex call_mutex;                  // the records and the pool serve one call at a time
-std::vector<Chunk> chunks(kSlabRuns);   // warm memory
+constexpr int64_t kRun = 64;  // rays a task marches
+constexpr size_t kSpareTapes = 2;
+std::mutex call_mutex;        // the pool and the spare tapes serve one call at a time
 int wanted_lanes = 0;                   // 0: the widest this machine has
 
 thread_local char error_text[256] = "";
@@ -77,6 +76,35 @@ template <class Work> int guarded(Work work) {
 
 }  // namespace
 
+// What a forward pass wrote down: all its samples, 64 bytes each for tables of 8 channels.
+struct Tape {
+    const Volume* volume;
+    int channels;
+    int64_t count;  // chunks in use
+    std::vector<Chunk> chunks;
+};
+
+namespace {
+
+std::vector<std::unique_ptr<Tape>> spare_tapes;  // their memory is warm
+
+std::unique_ptr<Tape> take_tape(const Volume* volume, int channels, int64_t count) {
+    std::unique_ptr<Tape> tape;
+    if (spare_tapes.empty()) {
+        tape = std::make_unique<Tape>();
+    } else {
+        tape = std::move(spare_tapes.back());
+        spare_tapes.pop_back();
+    }
+    tape->volume = volume;
+    tape->channels = channels;
+    tape->count = count;
+    if (tape->chunks.size() < size_t(count)) tape->chunks.resize(count);
+    return tape;
+}
+
+}  // namespace
+
 }  // namespace videorf
 }  // namespace holoreel
 
@@ -104,41 +132,46 @@ VIDEORF_API Volume* videorf_volume_new(const VideorfLattice* lattice) {
 VIDEORF_API void videorf_volume_free(Volume* volume) { delete volume; }
 VIDEORF_API int64_t videorf_volume_cells(const Volume* volume) { return volume->occupied_cells(); }
 
-// `samples` takes how many samples were taken.
+// `samples` takes how many samples were taken. With `tape` there will be a way back: `*tape` is what videorf_backward needs, to
+// be given to videorf_tape_free, and not to outlive the volume.
 VIDEORF_API int videorf_forward(const Volume* volume, const float* table, int32_t channels, const VideorfRays* rays,
-                                const VideorfImages* images, int64_t* samples) {
+                                const VideorfImages* images, int64_t* samples, Tape** tape) {
     return guarded([&] {
         check(*rays);
         const MarchKernels& kernel = kernels(channels);
-        const March march{volume, table, *rays, *images, {}};
+        const March march{volume, table, *rays, *images};
+        const int64_t runs = (rays->count + kRun - 1) / kRun;
+        std::unique_ptr<Tape> taken = tape ? take_tape(volume, channels, runs) : nullptr;
         std::atomic<int64_t> sum{0};
-        pool().run((rays->count + kRun - 1) / kRun, [&](int64_t run) {
-            sum += kernel.forward(march, run * kRun, std::min(rays->count, (run + 1) * kRun));
+        pool().run(runs, [&](int64_t run) {
+            Chunk* chunk = taken ? &taken->chunks[run] : nullptr;
+            sum += kernel.forward(march, run * kRun, std::min(rays->count, (run + 1) * kRun), chunk);
+            if (chunk) sort_by_shard(*volume, *chunk);
         });
         *samples = sum;
+        if (tape) *tape = taken.release();
     });
 }
 
 // `table_gradient` (rows, C) is overwritten; its last row, which empty vertices share, is 0. Its bits do not depend on the
 // number of threads: runs of rays are of a fixed length, and each run of rows is filled by one thread in the order of the rays.
-VIDEORF_API int videorf_backward(const Volume* volume, const float* table, int32_t channels, const VideorfRays* rays,
-                                 const VideorfImageGradients* gradients, float* table_gradient) {
+// A tape serves once.
+VIDEORF_API int videorf_backward(Tape* tape, const VideorfImageGradients* gradients, float* table_gradient) {
     return guarded([&] {
-        check(*rays);
-        const MarchKernels& kernel = kernels(channels);
-        const March march{volume, table, *rays, {}, *gradients};
-        std::memset(table_gradient, 0, sizeof(float) * volume->rows * channels);
-        const int64_t runs = (rays->count + kRun - 1) / kRun;
-        for (int64_t slab = 0; slab < runs; slab += kSlabRuns) {
-            const int64_t count = std::min(runs - slab, kSlabRuns);
-            pool().run(count, [&](int64_t i) {
-                const int64_t run = slab + i;
-                kernel.backward(march, run * kRun, std::min(rays->count, (run + 1) * kRun), chunks[i]);
-                sort_by_shard(*volume, chunks[i]);
-            });
-            pool().run(kShards, [&](int64_t shard) {
-                kernel.scatter(march, static_cast<int>(shard), chunks.data(), count, table_gradient);
-            });
-        }
+        const Volume& volume = *tape->volume;
+        const MarchKernels& kernel = kernels(tape->channels);
+        std::memset(table_gradient, 0, sizeof(float) * volume.rows * tape->channels);
+        pool().run(tape->count, [&](int64_t run) {
+            kernel.backward(*gradients, volume.spacing, run * kRun, tape->chunks[run]);
+        });
+        pool().run(kShards, [&](int64_t shard) {
+            kernel.scatter(volume, *gradients, static_cast<int>(shard), tape->chunks.data(), tape->count, table_gradient);
+        });
     });
+}
+
+VIDEORF_API void videorf_tape_free(Tape* tape) {
+    std::lock_guard<std::mutex> lock(call_mutex);
+    std::unique_ptr<Tape> given(tape);
+    if (given && spare_tapes.size() < kSpareTapes) spare_tapes.push_back(std::move(given));
 }

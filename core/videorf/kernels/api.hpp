@@ -4,7 +4,7 @@
 
 #include <cstdint>
 
-#define VIDEORF_ABI 1
+#define VIDEORF_ABI 2
 #define VIDEORF_API extern "C" __attribute__((visibility("default")))
 
 // Vertices lowest + spacing * (i, j, k); lookup (X, Y, Z) holds the row of each in the table, -1 where it is empty. The table

@@ -65,6 +65,7 @@ public:
             far = std::min(far, std::max(first, second));
         }
         step_ = static_cast<float>(rays.step);
+        per_step_ = 1.0f / step_;
         jitter_ = rays.jitter ? rays.jitter[ray] : 0.5f;
         entry = near;
         const double steps = (far - near) / rays.step - jitter_;
@@ -100,8 +101,8 @@ private:
         const float t = (static_cast<float>(next_) + jitter_) * step_;
         const int x = cell_at(0, t), y = cell_at(1, t), z = cell_at(2, t);
         const Volume& v = volume_;
-        if (v.brick_of[(size_t(x / kBrick) * v.bricks[1] + y / kBrick) * v.bricks[2] + z / kBrick]) return false;
         const bool far = !v.block_full[(size_t(x / kBlock) * v.blocks[1] + y / kBlock) * v.blocks[2] + z / kBlock];
+        if (!far && v.brick_of[(size_t(x / kBrick) * v.bricks[1] + y / kBrick) * v.bricks[2] + z / kBrick]) return false;
         const int edge = far ? kBlock : kBrick;
         const int at[3] = {x & -edge, y & -edge, z & -edge};
         float leave = std::numeric_limits<float>::max();
@@ -110,7 +111,7 @@ private:
             const float wall = static_cast<float>(inverse_[a] > 0 ? at[a] + edge : at[a]);
             leave = std::min(leave, (wall - start_[a]) * inverse_[a]);
         }
-        const float to = std::min(leave / step_ - jitter_, static_cast<float>(samples_));
+        const float to = std::min(leave * per_step_ - jitter_, static_cast<float>(samples_));
         next_ = std::max(next_ + 1, static_cast<int>(to));
         return true;
     }
@@ -154,7 +155,7 @@ private:
 
     const Volume& volume_;
     float start_[3], direction_[3], inverse_[3], limit_[3];
-    float step_, jitter_;
+    float step_, per_step_, jitter_;
     int next_ = 0, samples_;
 };
 
@@ -197,12 +198,16 @@ template <int C, bool kSlope, class Rows>
 HOLOREEL_INLINE void sample(const March& march, Batch& batch, Rows& rows) {
     const int32_t* corners = march.volume->rows_of.data();
     for (int i = 0; i < batch.count; i++)
+        for (int offset : {0, 1, kStrideY, kStrideY + 1, kStrideX, kStrideX + 1, kStrideX + kStrideY, kStrideX + kStrideY + 1})
+            __builtin_prefetch(march.table + size_t(corners[batch.corner[i] + offset]) * C);
+    for (int i = 0; i < batch.count; i++)
         rows[i] = interpolate<C>(march.table, corners + batch.corner[i], batch.x[i], batch.y[i], batch.z[i]);
     for (int i = 0; i < kBatch; i++) batch.density[i] = i < batch.count ? rows[i][0] : 0.0f;
     activate<kSlope>(batch, static_cast<float>(march.rays.step));
 }
 
-template <int C> int64_t forward_rays(const March& march, int64_t first, int64_t last) {
+template <int C, bool kTape>
+HOLOREEL_INLINE int64_t march_run(const March& march, int64_t first, int64_t last, Chunk* chunk) {
     using Row = typename RowOf<C>::type;
     const float least = static_cast<float>(march.rays.transmittance_min);
     int64_t samples = 0;
@@ -210,89 +215,89 @@ template <int C> int64_t forward_rays(const March& march, int64_t first, int64_t
     Row rows[kBatch];
     for (int64_t ray = first; ray < last; ray++) {
         Walk walk(*march.volume, march.rays, ray);
+        const float entry = static_cast<float>(walk.entry);
         Row sum = {};
         float left = 1, distance = 0;
         bool open = true;
         while (open && walk.next(batch)) {
-            sample<C, false>(march, batch, rows);
-            for (int i = 0; i < batch.count && open; i++, samples++) {
-                const float weight = left * batch.alpha[i];
-                sum += rows[i] * weight;
-                distance += weight * batch.t[i];
-                left *= batch.passed[i];
+            sample<C, kTape>(march, batch, rows);
+            int taken = 0;
+            for (; taken < batch.count && open; taken++) {
+                const float weight = left * batch.alpha[taken];
+                sum += rows[taken] * weight;
+                distance += weight * batch.t[taken];
+                left *= batch.passed[taken];
                 open = left > least;
+                if (!kTape) continue;
+                const int i = taken;
+                chunk->records.push_back({batch.corner[i], batch.x[i], batch.y[i], batch.z[i], weight,
+                                          entry + batch.t[i], left, batch.slope[i]});
+                chunk->rays.push_back(static_cast<int32_t>(ray));
             }
+            if (kTape) {
+                const float* from = reinterpret_cast<const float*>(rows);
+                chunk->rows.insert(chunk->rows.end(), from, from + size_t(taken) * C);
+            }
+            samples += taken;
+        }
+        if (kTape) {
+            chunk->ends.push_back(static_cast<uint32_t>(chunk->records.size()));
+            chunk->left.push_back(left);
         }
         const float weights = 1 - left;
         sum[0] = left;
         store_row<C>(march.images.accumulated + C * ray, sum);
-        march.images.depth[ray] =
-            static_cast<float>((distance + weights * walk.entry) * march.volume->spacing);
+        march.images.depth[ray] = static_cast<float>((distance + weights * walk.entry) * march.volume->spacing);
     }
     return samples;
 }
 
-// What the way back needs of a sample.
-struct Step {
-    float weight, after, seen, slope;  // seen: what the loss gains per weight
-};
-
-template <int C> void backward_rays(const March& march, int64_t first, int64_t last, Chunk& chunk) {
-    using Row = typename RowOf<C>::type;
-    static thread_local std::vector<Step> steps;
-    const float least = static_cast<float>(march.rays.transmittance_min);
-    const VideorfImageGradients& gradients = march.gradients;
-    chunk.records.clear();
-    Batch batch;
-    Row rows[kBatch];
-    for (int64_t ray = first; ray < last; ray++) {
-        Walk walk(*march.volume, march.rays, ray);
-        Row incoming = {};
-        if (gradients.accumulated) incoming = load_row<C>(gradients.accumulated + C * ray);
-        const float d_left = incoming[0];
-        incoming[0] = 0;
-        const float d_distance =
-            gradients.depth ? static_cast<float>(gradients.depth[ray] * march.volume->spacing) : 0.0f;
-        const float entry = static_cast<float>(walk.entry);
-        float left = 1;
-        bool open = true;
-        steps.clear();
-        while (open && walk.next(batch)) {
-            sample<C, true>(march, batch, rows);
-            for (int i = 0; i < batch.count && open; i++) {
-                const float weight = left * batch.alpha[i];
-                left *= batch.passed[i];
-                open = left > least;
-                const float seen = sum_row<C>(rows[i] * incoming) + d_distance * (entry + batch.t[i]);
-                steps.push_back({weight, left, seen, batch.slope[i]});
-                chunk.records.push_back(
-                    {batch.corner[i], batch.x[i], batch.y[i], batch.z[i], weight, 0, static_cast<int32_t>(ray)});
-            }
-        }
-        // A denser sample takes light from all behind it, and from the background.
-        float behind = d_left * left;
-        Record* record = chunk.records.data() + chunk.records.size();
-        for (size_t k = steps.size(); k-- > 0;) {
-            const Step& step = steps[k];
-            (--record)->density = (step.after * step.seen - behind) * step.slope;
-            behind += step.weight * step.seen;
-        }
-    }
-    chunk.samples = static_cast<int64_t>(chunk.records.size());
+template <int C> int64_t forward_rays(const March& march, int64_t first, int64_t last, Chunk* chunk) {
+    if (!chunk) return march_run<C, false>(march, first, last, nullptr);
+    chunk->records.clear();
+    chunk->rows.clear();
+    chunk->ends.clear();
+    chunk->left.clear();
+    chunk->rays.clear();
+    return march_run<C, true>(march, first, last, chunk);
 }
 
-template <int C> void scatter_shard(const March& march, int shard, const Chunk* chunks, int64_t count, float* gradient) {
+template <int C>
+void backward_rays(const VideorfImageGradients& gradients, double spacing, int64_t first, Chunk& chunk) {
     using Row = typename RowOf<C>::type;
-    const Volume& volume = *march.volume;
+    uint32_t begin = 0;
+    for (size_t i = 0; i < chunk.ends.size(); begin = chunk.ends[i++]) {
+        const int64_t ray = first + static_cast<int64_t>(i);
+        Row incoming = {};
+        if (gradients.accumulated) incoming = load_row<C>(gradients.accumulated + C * ray);
+        const float d_distance = gradients.depth ? static_cast<float>(gradients.depth[ray] * spacing) : 0.0f;
+        // A denser sample takes light from all behind it, and from the background.
+        float behind = incoming[0] * chunk.left[i];
+        incoming[0] = 0;
+        for (uint32_t k = chunk.ends[i]; k-- > begin;) {
+            Record& record = chunk.records[k];
+            const Row row = load_row<C>(chunk.rows.data() + size_t(k) * C);
+            const float seen = sum_row<C>(row * incoming) + d_distance * record.distance;
+            record.slope *= record.after * seen - behind;
+            behind += record.weight * seen;
+        }
+    }
+}
+
+template <int C>
+void scatter_shard(const Volume& volume, const VideorfImageGradients& gradients, int shard, const Chunk* chunks,
+                   int64_t count, float* gradient) {
+    using Row = typename RowOf<C>::type;
     const int from = shard * volume.shard_rows, to = std::min(from + volume.shard_rows, volume.rows - 1);
     alignas(64) float elsewhere[C] = {};  // takes what belongs to other shards and to the empty row
     for (const Chunk* chunk = chunks; chunk < chunks + count; chunk++) {
         for (uint32_t i = chunk->begin[shard]; i < chunk->begin[shard + 1]; i++) {
-            const Record& record = chunk->records[chunk->order[i]];
+            const uint32_t index = chunk->order[i];
+            const Record& record = chunk->records[index];
             Row row = {};
-            if (march.gradients.accumulated)
-                row = load_row<C>(march.gradients.accumulated + size_t(record.ray) * C) * record.weight;
-            row[0] = record.density;
+            if (gradients.accumulated)
+                row = load_row<C>(gradients.accumulated + size_t(chunk->rays[index]) * C) * record.weight;
+            row[0] = record.slope;
             const int32_t* rows = volume.rows_of.data() + record.corner;
             const float wx[2] = {1 - record.x, record.x}, wy[2] = {1 - record.y, record.y};
             const float wz[2] = {1 - record.z, record.z};
