@@ -1,17 +1,20 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Pictures of full models against a renderer of its own: dense, float64, numpy, written from the paper's formulas."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from holoreel.core.camera import Camera
-from holoreel.core.draw import Player
+from holoreel.core.draw import Player, draw, to_tensors
 from holoreel.core.errors import HoloreelError
 from holoreel.core.gaussians.decoder import Decoder, write_pt
 from holoreel.core.gaussians.ply import write_ply
 from holoreel.core.reel import SegmentPayload, load_gaussians, save_gaussians, write_segments
 from holoreel.core.render import get_backend
+from holoreel.core.render.view import decoder_tensors
+from holoreel.core.render.warp import lens_warp
 
-W, H, FX, FY, CX, CY = 96, 64, 88.0, 80.0, 40.0, 37.5
 ACTIVATIONS = {
     "sigmoid": lambda x: 1.0 / (1.0 + np.exp(-x)),
     "clamp": lambda x: np.clip(x, 0.0, 1.0),
@@ -26,7 +29,7 @@ def camera() -> Camera:
     turn = turn @ np.array([[1, 0, 0], [0, np.cos(b), -np.sin(b)], [0, np.sin(b), np.cos(b)]])
     pose = np.eye(4)
     pose[:3, :3], pose[:3, 3] = turn, (0.3, -0.2, 0.4)
-    return Camera(W, H, FX, FY, CX, CY, pose)
+    return Camera(96, 64, 88.0, 80.0, 40.0, 37.5, pose)
 
 
 def rotations(q):
@@ -38,8 +41,14 @@ def rotations(q):
     ], 1)  # fmt: skip
 
 
-def dense_picture(model, hidden, output, activation, time, pose):
-    """Every Gaussian at every pixel, front to back; returns color (H, W, 3), alpha and depth (H, W)."""
+def dense_picture(model, hidden, output, activation, time, camera, places=None):
+    """Every Gaussian at every place, front to back; returns color (H, W, 3), alpha and depth (H, W).
+
+    Places (H, W, 2) in pixels are the pixels' centers unless given.
+    """
+    W, H, FX, FY, CX, CY = (getattr(camera, name) for name in ("width", "height", "fx", "fy", "cx", "cy"))
+    pose = camera.world_to_camera
+    v, u = np.mgrid[:H, :W] + 0.5 if places is None else (places[..., 1], places[..., 0])
     p = {name: np.asarray(values, np.float64) for name, values in vars(model).items()}
     dt = time - p["trbf_centers"]
     d = dt[:, None]
@@ -50,9 +59,13 @@ def dense_picture(model, hidden, output, activation, time, pose):
     axes = turns * np.exp(p["log_scales"])[:, None, :]
     view, shift = pose[:3, :3], pose[:3, 3]
     local = means @ view.T + shift
-    v, u = np.mgrid[:H, :W] + 0.5
-    total, alpha_sum, depth_sum, passed = np.zeros((H, W, 9)), np.zeros((H, W)), np.zeros((H, W)), np.ones((H, W))
-    done = np.zeros((H, W), bool)
+    total, alpha_sum, depth_sum, passed = (
+        np.zeros((*u.shape, 9)),
+        np.zeros(u.shape),
+        np.zeros(u.shape),
+        np.ones(u.shape),
+    )
+    done = np.zeros(u.shape, bool)
     for i in np.argsort(local[:, 2], kind="stable"):
         x, y, z = local[i]
         if z < 0.2:
@@ -72,12 +85,12 @@ def dense_picture(model, hidden, output, activation, time, pose):
         alpha_sum += weight
         depth_sum += weight * z
         passed -= weight
-    directions = np.stack([(u - CX) / FX, (v - CY) / FY, np.ones((H, W))], 2) @ view
+    directions = np.stack([(u - CX) / FX, (v - CY) / FY, np.ones(u.shape)], 2) @ view
     directions /= np.linalg.norm(directions, axis=2, keepdims=True)
     origins = np.broadcast_to(-view.T @ shift, directions.shape)
     inputs = np.concatenate([total[..., 3:], origins, directions], 2)
     color = ACTIVATIONS[activation](total[..., :3] + np.maximum(inputs @ hidden.T, 0) @ output.T)  # Eq. 11
-    return color, alpha_sum, np.divide(depth_sum, alpha_sum, out=np.zeros((H, W)), where=alpha_sum > 0)
+    return color, alpha_sum, np.divide(depth_sum, alpha_sum, out=np.zeros(u.shape), where=alpha_sum > 0)
 
 
 def psnr(a, b):
@@ -109,7 +122,7 @@ def test_pictures_are_what_the_formulas_say(tmp_path, full, activation, backend)
     pictures = []
     for frame in (1, 3.5, 8):
         drawn = player.draw(pose, frame)
-        color, alpha, depth = dense_picture(model, hidden, output, activation, (frame - 1) / 8, pose.world_to_camera)
+        color, alpha, depth = dense_picture(model, hidden, output, activation, (frame - 1) / 8, pose)
         assert alpha.max() > 0.9
         assert psnr(drawn.image, color) >= 80.0, frame
         assert psnr(drawn.alpha, alpha) >= 80.0
@@ -157,5 +170,58 @@ def test_each_segment_has_its_own_network(tmp_path, full):
     for frame in (2, 6, 3, 7):
         decoder = decoders[frame > 4]
         time = (frame - 1) % 4 / 4
-        color, _, _ = dense_picture(model, decoder.hidden, output, "sigmoid", time, camera().world_to_camera)
+        color, _, _ = dense_picture(model, decoder.hidden, output, "sigmoid", time, camera())
         assert psnr(player.draw(camera(), frame).image, color) >= 80.0
+
+
+LENSES = {
+    "OPENCV": (-0.2, 0.05, 0.002, -0.003),
+    "FULL_OPENCV": (0.4, -0.02, 0.001, 0.002, 0.0, 0.05, 0.0, 0.0),
+    "OPENCV_FISHEYE": (0.05, -0.01, 0.0, 0.0),
+}
+
+
+@pytest.mark.parametrize("full_model", [False, True])
+@pytest.mark.parametrize("lens", LENSES)
+def test_lenses_bend_what_a_pinhole_sees(full, lens, full_model):
+    """Each pixel shows what the pinhole's formulas say where its own ray goes; color, alpha and depth alike."""
+    model, hidden, output = full
+    model.log_scales[:] = model.log_scales.clip(-2.5)  # nothing finer than what interpolation can follow
+    model.opacity_logits[:] = model.opacity_logits.clip(-3, 0)
+    if not full_model:
+        model = replace(model, features=model.features[:, :3])
+    straight = camera()
+    bent = replace(straight, model=lens, distortion=LENSES[lens])
+    decoder = Decoder(hidden, output, "sigmoid") if full_model else None
+    background = (0.2, 0.9, 0.4)
+    drawn = draw(
+        to_tensors(model, full_model), 0.4, bent, get_backend("reference"), background,
+        decoder_tensors(decoder) if decoder else None,
+    )  # fmt: skip
+    local = bent.rays()[1] @ bent.world_to_camera[:3, :3].T
+    virtual = lens_warp(bent).pinhole
+    plane = local[:, :2] / local[:, 2:]
+    places = (plane * (virtual.fx, virtual.fy) + (virtual.cx, virtual.cy)).reshape(bent.height, bent.width, 2)
+    nine = model if full_model else replace(model, features=np.pad(model.features, ((0, 0), (0, 6))))
+    zeros = np.zeros_like(output)
+    color, alpha, depth = dense_picture(
+        nine, hidden, output if full_model else zeros, "sigmoid" if full_model else "none", 0.4, virtual, places
+    )
+    if not full_model:
+        color = color + (1 - alpha)[..., None] * background
+    assert alpha.std() > 0.1
+    assert psnr(drawn.image, color) > 40.0
+    assert psnr(drawn.alpha, alpha) > 40.0
+    solid = alpha > 0.3
+    assert np.abs(drawn.depth - depth)[solid].mean() < 0.02
+    assert psnr(drawn.alpha, draw(to_tensors(model), 0.4, straight, get_backend("reference")).alpha) < 35.0
+
+
+def test_what_a_lens_cannot_see_is_background(random_model):
+    """A fisheye that bends more than a pinhole reaches: the corners show the background, nothing else."""
+    wide = Camera(80, 60, 18.0, 18.0, 40.0, 30.0, model="OPENCV_FISHEYE", distortion=(0.0, 0.0, 0.0, 0.0))
+    drawn = draw(to_tensors(random_model(50)), 0.5, wide, get_backend("reference"), (0.25, 0.5, 0.75))
+    np.testing.assert_allclose(drawn.image[:2, :2], np.broadcast_to((0.25, 0.5, 0.75), (2, 2, 3)), atol=1e-6)
+    assert not drawn.alpha[:2, :2].any()
+    assert not drawn.depth[:2, :2].any()
+    assert drawn.alpha[25:35, 35:45].max() > 0.3
