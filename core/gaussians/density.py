@@ -56,7 +56,7 @@ def densify(
 def _child(rows: dict[str, Tensor], shrink: float, rng: torch.Generator) -> dict[str, Tensor]:
     """Move a Gaussian to a random place inside itself and shrink it."""
     scales = rows["log_scales"].exp()
-    offset = torch.randn(scales.shape, generator=rng) * scales
+    offset = torch.randn(scales.shape, generator=rng).to(scales.device) * scales
     rows["means"] = rows["means"] + torch.einsum("nij,nj->ni", rotation_matrices(rows["quats"]), offset)
     rows["log_scales"] = (scales / shrink).log()
     return rows
@@ -75,7 +75,7 @@ def peak_opacity(parameters: Parameters, times: Tensor) -> Tensor:
 
 def broken_rows(parameters: Parameters) -> Tensor:
     """Return which Gaussians have a parameter that is not finite, (N,) bool."""
-    broken = torch.zeros(len(parameters), dtype=torch.bool)
+    broken = torch.zeros(len(parameters), dtype=torch.bool, device=parameters.device)
     for value in parameters.tensors.values():
         broken |= ~torch.isfinite(value.detach().reshape(len(value), -1)).all(dim=1)
     return broken
@@ -95,7 +95,7 @@ def outside_rows(parameters: Parameters, scene: SceneScale) -> Tensor:
 
 def prune(parameters: Parameters, causes: Mapping[str, Tensor]) -> dict[str, int]:
     """Delete the rows that any cause names (masks (N,)); return how many each took, the first one that names a row."""
-    gone = torch.zeros(len(parameters), dtype=torch.bool)
+    gone = torch.zeros(len(parameters), dtype=torch.bool, device=parameters.device)
     counts = {}
     for cause, rows in causes.items():
         counts[cause] = int((rows & ~gone).sum())

@@ -41,9 +41,9 @@ def share(opacities: Tensor, copies: Tensor) -> tuple[Tensor, Tensor]:
     old = opacities.double().clamp(*OPACITY_LIMITS)
     copies = copies.clamp(1, MOST_COPIES)
     new = 1.0 - (1.0 - old) ** (1.0 / copies)
-    powers = new[:, None] ** torch.arange(1, MOST_COPIES + 1, dtype=torch.float64)
+    powers = new[:, None] ** torch.arange(1, MOST_COPIES + 1, dtype=torch.float64, device=new.device)
     # Sum over i = 1 … copies of row i − 1 of the table.
-    cumulative = _binomials().cumsum(dim=0)[copies - 1]
+    cumulative = _binomials().cumsum(dim=0).to(new.device)[copies - 1]
     return new.to(opacities.dtype), (old / (cumulative * powers).sum(dim=1)).to(opacities.dtype)
 
 
@@ -65,6 +65,7 @@ def multiply(parameters: Parameters, sources: Tensor, targets: Tensor | None) ->
     for name, value in parameters.tensors.items():
         value.detach()[targets] = copies[name]
     parameters.units[targets] = parameters.units[sources]
+    parameters.paces[targets] = parameters.paces[sources]
     parameters.forget(targets)
 
 
@@ -81,13 +82,15 @@ def relocate(parameters: Parameters, dead: Tensor, rng: torch.Generator) -> int:
 def grow(parameters: Parameters, count: int, rng: torch.Generator) -> None:
     """Add `count` copies of Gaussians drawn in proportion to opacity."""
     if count > 0 and len(parameters):
-        multiply(parameters, _draw(parameters, torch.arange(len(parameters)), count, rng), None)
+        multiply(
+            parameters, _draw(parameters, torch.arange(len(parameters), device=parameters.device), count, rng), None
+        )
 
 
 def _draw(parameters: Parameters, rows: Tensor, count: int, rng: torch.Generator) -> Tensor:
     """Draw `count` of `rows` with replacement, in proportion to opacity."""
     weights = parameters.tensors["opacity_logits"].detach()[rows].sigmoid().double().cumsum(dim=0)
-    places = torch.rand(count, generator=rng, dtype=torch.float64) * weights[-1]
+    places = torch.rand(count, generator=rng, dtype=torch.float64).to(weights.device) * weights[-1]
     return rows[torch.searchsorted(weights, places).clamp(max=len(rows) - 1)]
 
 
@@ -97,7 +100,10 @@ def wander(parameters: Parameters, strength: float, rng: torch.Generator) -> Non
     opacities = values["opacity_logits"].sigmoid()
     gate = torch.sigmoid(-GATE_STEEPNESS * (opacities - GATE_OPACITY))
     axes = rotation_matrices(values["quats"]) * values["log_scales"].exp()[:, None, :]
-    noise = torch.randn(values["means"].shape, generator=rng) * (strength * gate / parameters.units)[:, None]
+    noise = (
+        torch.randn(values["means"].shape, generator=rng).to(parameters.device)
+        * (strength * gate / parameters.units)[:, None]
+    )
     step = torch.einsum("nij,nkj,nk->ni", axes, axes, noise)
     # A huge Gaussian may not leave the scene in one step.
     length = step.norm(dim=1, keepdim=True)

@@ -33,12 +33,13 @@ class Rate(NamedTuple):
 
 
 def _ones(means: Tensor) -> Tensor:
-    return torch.ones(len(means))
+    return torch.ones(len(means), device=means.device)
 
 
-def empty_stats(count: int) -> DensityStats:
+def empty_stats(count: int, device: str = "cpu") -> DensityStats:
     """Make the accumulators that a backward pass fills."""
-    return DensityStats(torch.zeros(count), torch.zeros(count, dtype=torch.int32), torch.zeros(count))
+    gradient, radius = torch.zeros(2, count, device=device)
+    return DensityStats(gradient, torch.zeros(count, dtype=torch.int32, device=device), radius)
 
 
 class Parameters:
@@ -50,21 +51,26 @@ class Parameters:
     """
 
     def __init__(
-        self, gaussians: SpacetimeGaussians, network: Mapping[str, Tensor] | None = None, measure: Measure = _ones
+        self,
+        gaussians: SpacetimeGaussians,
+        network: Mapping[str, Tensor] | None = None,
+        measure: Measure = _ones,
+        device: str = "cpu",
     ):
-        self.tensors = {
-            name: torch.from_numpy(np.ascontiguousarray(getattr(gaussians, name), np.float32)).requires_grad_()
-            for name in SpacetimeTensors._fields
+        self.device = device
+        arrays = {name: np.ascontiguousarray(getattr(gaussians, name), np.float32) for name in SpacetimeTensors._fields}
+        self.tensors = {name: torch.from_numpy(array).to(device).requires_grad_() for name, array in arrays.items()}
+        self.network = {
+            name: value.detach().to(device, copy=True).requires_grad_() for name, value in (network or {}).items()
         }
-        self.network = {name: value.detach().clone().requires_grad_() for name, value in (network or {}).items()}
         everything = {**self.tensors, **self.network}
         self.first = {name: torch.zeros_like(value) for name, value in everything.items()}
         self.second = {name: torch.zeros_like(value) for name, value in everything.items()}
         self.steps = 0
         self.measure = measure
         self.units = measure(self.tensors["means"].detach())
-        self.paces = torch.ones(len(self))
-        self.stats = empty_stats(len(self))
+        self.paces = torch.ones(len(self), device=device)
+        self.stats = empty_stats(len(self), device)
 
     def __len__(self) -> int:
         return len(self.tensors["means"])
@@ -76,7 +82,7 @@ class Parameters:
 
     def to_gaussians(self) -> SpacetimeGaussians:
         """Copy the values out."""
-        return SpacetimeGaussians(**{name: value.detach().numpy().copy() for name, value in self.tensors.items()})
+        return SpacetimeGaussians(**{name: value.detach().cpu().numpy().copy() for name, value in self.tensors.items()})
 
     def step(self, rates: Mapping[str, Rate], backend: ModuleType) -> None:
         """Take one Adam step with a learning rate per tensor, and clear the gradients."""
@@ -105,14 +111,14 @@ class Parameters:
     def append(self, rows: Mapping[str, Tensor]) -> None:
         """Add rows with zero moments."""
         for name, value in self.tensors.items():
-            new = rows[name].detach()
+            new = rows[name].detach().to(self.device)
             self.tensors[name] = torch.cat([value.detach(), new]).requires_grad_()
             self.first[name] = torch.cat([self.first[name], torch.zeros_like(new)])
             self.second[name] = torch.cat([self.second[name], torch.zeros_like(new)])
-        self.units = torch.cat([self.units, self.measure(rows["means"])])
+        self.units = torch.cat([self.units, self.measure(rows["means"].detach().to(self.device))])
         stats = [getattr(self.stats, name) for name in ROW_STATE]
         added = len(rows["means"])
-        self.paces = torch.cat([self.paces, torch.ones(added)])
+        self.paces = torch.cat([self.paces, self.paces.new_ones(added)])
         self.stats = DensityStats(*(torch.cat([value, value.new_zeros(added)]) for value in stats))
 
     def forget(self, rows: Tensor) -> None:
@@ -139,16 +145,17 @@ class Parameters:
         }
 
     @classmethod
-    def from_state(cls, state: Mapping, measure: Measure = _ones) -> "Parameters":
+    def from_state(cls, state: Mapping, measure: Measure = _ones, device: str = "cpu") -> "Parameters":
         """Rebuild from `state`."""
+
+        def copied(values: Mapping[str, Tensor]) -> dict[str, Tensor]:
+            return {name: value.detach().to(device, copy=True) for name, value in values.items()}
+
         self = cls.__new__(cls)
-        self.tensors = {name: value.clone().requires_grad_() for name, value in state["tensors"].items()}
-        self.network = {name: value.clone().requires_grad_() for name, value in state["network"].items()}
-        self.first = {name: value.clone() for name, value in state["first"].items()}
-        self.second = {name: value.clone() for name, value in state["second"].items()}
-        self.steps = int(state["steps"])
-        self.measure = measure
-        self.units = state["units"].clone()
-        self.paces = state["paces"].clone()
-        self.stats = DensityStats(*(state["stats"][name].clone() for name in ROW_STATE))
+        self.device, self.measure, self.steps = device, measure, int(state["steps"])
+        self.tensors = {name: value.requires_grad_() for name, value in copied(state["tensors"]).items()}
+        self.network = {name: value.requires_grad_() for name, value in copied(state["network"]).items()}
+        self.first, self.second = copied(state["first"]), copied(state["second"])
+        self.units, self.paces = copied({"units": state["units"], "paces": state["paces"]}).values()
+        self.stats = DensityStats(**copied(state["stats"]))
         return self

@@ -3,7 +3,7 @@
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -41,13 +41,24 @@ class SceneScale:
     focals: Tensor
     """(K,) focal lengths in pixels"""
 
+    def to(self, device: str) -> "SceneScale":
+        """Return the same with its tensors on a device."""
+        return replace(
+            self,
+            centers=self.centers.to(device),
+            box=self.box.to(device),
+            axes=self.axes.to(device),
+            cosines=self.cosines.to(device),
+            focals=self.focals.to(device),
+        )
+
     def footprints(self, means: Tensor) -> Tensor:
         """Return what one pixel of the nearest camera that sees it covers at each of `means` (N, 3), (N,).
 
         Where no camera looks, the nearest one counts.
         """
-        seen_best = torch.full((len(means),), math.inf)
-        best = torch.full((len(means),), math.inf)
+        best = torch.full((len(means),), math.inf, device=means.device)
+        seen_best = best.clone()
         for center, axis, cosine, focal in zip(self.centers, self.axes, self.cosines, self.focals, strict=True):
             offset = means - center
             distance = offset.norm(dim=1)
@@ -59,7 +70,7 @@ class SceneScale:
 
     def extents(self, means: Tensor) -> Tensor:
         """Return the extent of the cameras for each of `means` (N, 3), (N,)."""
-        return torch.full((len(means),), self.extent)
+        return torch.full((len(means),), self.extent, device=means.device)
 
 
 def measure_scene(capture: Capture, points: ArrayLike) -> SceneScale:

@@ -119,19 +119,20 @@ class Trainer:
                 f"{capture.source}: the capture has no seed points; make them of its pictures with `holoreel sfm`, or "
                 "synthesize it with --seed-points."
             )
-        self.scene = measure_scene(capture, xyz)
+        self.device: str = getattr(backend, "DEVICE", "cpu")
+        self.scene = measure_scene(capture, xyz).to(self.device)
         self.measure = self.scene.footprints if config.unit == "footprint" else self.scene.extents
         # Ray origins are the network's one input in world units; this makes them comparable with the others.
         self._origin_scale = 1.0 / max(float(self.scene.centers.norm(dim=1).max()), self.scene.nearest * 1e-3)
-        self.times = torch.tensor(capture.times, dtype=torch.float32)
-        self.background = torch.tensor(config.background)
+        self.times = torch.tensor(capture.times, dtype=torch.float32, device=self.device)
+        self.background = torch.tensor(config.background, device=self.device)
         # What is too near to a camera to stay must not be too near to be seen.
         near = 0.5 * config.density.prune_depth * self.scene.nearest or Rules.near
         self.rules = Rules(near=min(Rules.near, near), detach_motion_time=config.detach_time)
         self.rng = torch.Generator().manual_seed(config.seed)
         if seeds is None:
             seeds = self._fitted(gaussians_from_points(points, config, np.random.default_rng(config.seed)))
-        self.parameters = Parameters(as_trained(seeds, config), self._network(decoder), self.measure)
+        self.parameters = Parameters(as_trained(seeds, config), self._network(decoder), self.measure, self.device)
         self.inherited = inherited
         self.parameters.paces[:inherited] = config.inherited_pace
         self.pictures = PictureStream(capture, self.views, config.background, config.seed, config.picture_memory)
@@ -147,7 +148,7 @@ class Trainer:
 
     def _fitted(self, seeds: SpacetimeGaussians) -> SpacetimeGaussians:
         """Keep seeds from being specks or fog where neighbors are no measure of their size."""
-        footprints = self.scene.footprints(torch.from_numpy(seeds.means)).numpy()[:, None]
+        footprints = self.scene.footprints(torch.from_numpy(seeds.means).to(self.device)).cpu().numpy()[:, None]
         low, high = (np.log(pixels * footprints) for pixels in SEED_PIXELS)
         seeds.log_scales = np.clip(seeds.log_scales, low, high).astype(np.float32)
         return seeds
@@ -257,12 +258,13 @@ class Trainer:
         paces = self.parameters.paces if self.inherited else None
         units = self.parameters.units if paces is None else self.parameters.units * paces
         decay = rates.final_factor ** (self.iteration / config.planned)
-        orders = (torch.arange(9) // 3 < config.motion).to(torch.float32)
+        orders = (torch.arange(9, device=self.device) // 3 < config.motion).to(torch.float32)
         if config.model == "lite":
             colors = Rate(rates.features * decay, paces, None, *((0.0, 1.0) if config.clamp_colors else ()))
         else:
-            colors = Rate(decay, paces, torch.tensor([rates.features] * 6 + [rates.features_time] * 3))
-        inputs = torch.ones(SHAPES["hidden"][1])
+            columns = [rates.features] * 6 + [rates.features_time] * 3
+            colors = Rate(decay, paces, torch.tensor(columns, device=self.device))
+        inputs = torch.ones(SHAPES["hidden"][1], device=self.device)
         inputs[6:9] = self._origin_scale
         temporal = decay if config.temporal_opacity else 0.0
         return {
@@ -329,9 +331,9 @@ class Trainer:
         rendering = self.render(camera, self.capture.time(view[1]))
         valid = valid_pixels(camera)
         patches = measure_patches(
-            rendering.features.numpy(), truth, self.config.guided.patch, None if valid is None else valid.numpy()
+            rendering.features.cpu().numpy(), truth, self.config.guided.patch, None if valid is None else valid.numpy()
         )
-        return patches, rendering.depth.numpy(), rendering.alpha.numpy()
+        return patches, rendering.depth.cpu().numpy(), rendering.alpha.cpu().numpy()
 
     def gaussians(self) -> SpacetimeGaussians:
         """Copy the trained Gaussians out."""
@@ -341,7 +343,7 @@ class Trainer:
         """Copy a full model's network out; None for a lite one."""
         if not self.parameters.network:
             return None
-        weights = {name: value.detach().numpy().copy() for name, value in self.parameters.network.items()}
+        weights = {name: value.detach().cpu().numpy().copy() for name, value in self.parameters.network.items()}
         return Decoder(**weights, activation=self.config.decoder_output)
 
     def state(self) -> dict[str, object]:
@@ -362,7 +364,7 @@ class Trainer:
 
     def load_state(self, state: Mapping) -> None:
         """Go on where `state` was taken."""
-        self.parameters = Parameters.from_state(state["parameters"], self.measure)
+        self.parameters = Parameters.from_state(state["parameters"], self.measure, self.device)
         self.rng.set_state(state["rng"])
         self.pictures.load_state(state["pictures"])
         self.iteration, self.seconds = int(state["iteration"]), float(state["seconds"])
