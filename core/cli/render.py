@@ -38,7 +38,7 @@ def run(
     Colors are display-referred, in EXR as well; an EXR also holds alpha, and depth in its channel Z.
 
     Args:
-        file: the .reel, .ply or .splatv.
+        file: the .reel, .ply, .stgc or .splatv.
         out: FILE.png or FILE.exr for one camera; a folder for a set (OUT/CAMERA/FRAME.png).
         camera: CAMERA.json with model, width, height, fx, fy, cx, cy, world_to_camera.
         cameras: instead, a capture (folder or transforms.json) whose cameras look.

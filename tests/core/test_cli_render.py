@@ -126,7 +126,7 @@ def test_files_made_by_others_give_a_picture(shared_data, tmp_path, name, capsys
         ("REEL --camera OUT/none.json --frame 1 --out OUT/a.png", "none.json"),
         ("REEL --camera REEL --frame 1 --out OUT/a.png", "a.reel"),
         ("OUT/none.reel --camera CAMERA --frame 1 --out OUT/a.png", "none.reel"),
-        ("CAMERA --camera CAMERA --frame 1 --out OUT/a.png", ".reel, .ply or .splatv"),
+        ("CAMERA --camera CAMERA --frame 1 --out OUT/a.png", ".reel, .ply, .stgc or .splatv"),
         ("LATE --cameras CAPTURE --out OUT", "frames 102 to 104"),
     ],
 )
