@@ -6,7 +6,7 @@ kept as long as it was made with the same settings from the same capture; a stop
 """
 
 import hashlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from types import ModuleType
@@ -27,8 +27,6 @@ from ..lpips import Lpips
 from ..report import Picture, Report, Row, Section, Table, write_report
 
 CROP = 8  # crops are this part of the picture, along its longer side
-ITERATIONS = 2000
-GAUSSIANS = 40_000
 
 
 @dataclass(frozen=True)
@@ -65,6 +63,32 @@ class Finished:
     seconds: float
 
 
+def run_ablation(
+    scenes: Sequence[Path],
+    out: Path,
+    iterations: int,
+    gaussians: int,
+    parts: Sequence[str],
+    lpips: Sequence[Lpips],
+    backend: ModuleType,
+) -> Iterator[str]:
+    """Make the tables of several captures; yield what there is to print: each scene's table, and the page's path.
+
+    Raises `HoloreelError` where two captures have one name, or as `ablate` does.
+    """
+    if iterations < 1 or gaussians < 1:
+        raise HoloreelError("--iterations and --gaussians must be 1 or more.")
+    named = {scene.resolve().name: scene for scene in scenes}
+    if not named or len(named) < len(scenes):
+        raise HoloreelError("--scenes: name one capture or more, each in a folder of another name.")
+    config = default_config(iterations, gaussians)
+    results: dict[str, dict[str, Finished]] = {}
+    for name, scene in named.items():
+        results[name] = ablate(scene, out / name, config, backend, parts, lpips)
+        yield f"{name}\n{as_text(table(results[name]))}\n"
+    yield str(write_results(out, named, results, config))
+
+
 def ablate(
     scene: Path,
     out: Path,
@@ -88,13 +112,12 @@ def ablate(
         raise HoloreelError(
             f"{scene}: every camera is trained on; hold one out, so that there is something to measure."
         )
-    print_of_capture = fingerprint(capture)
-    return {
-        part.key: _row(
-            capture, print_of_capture, out / part.key, part, part.change(config), backend, lpips, on_progress
-        )
-        for part in chosen
+    digest = fingerprint(capture)
+    rows = {
+        part.key: _row(capture, digest, out / part.key, part, part.change(config), backend, lpips, on_progress)
+        for part in sorted(chosen, key=lambda part: part.key != FULL)  # what all others are compared with comes first
     }
+    return {part.key: rows[part.key] for part in chosen}
 
 
 def fingerprint(capture: Capture) -> str:
@@ -109,7 +132,7 @@ def fingerprint(capture: Capture) -> str:
 
 def _row(
     capture: Capture,
-    print_of_capture: str,
+    digest: str,
     folder: Path,
     part: Part,
     config: TrainConfig,
@@ -118,7 +141,7 @@ def _row(
     on_progress: Callable[[Part, int, int], None] | None,
 ) -> Finished:
     record_path = folder / "row.json"
-    made_of = {"config": _plain(asdict(config)), "capture": print_of_capture}
+    made_of = {"config": _plain(asdict(config)), "capture": digest}
     record = read_json(record_path) if record_path.is_file() else {}
     reel = folder / "model.reel"
     if {key: record.get(key) for key in made_of} != made_of:

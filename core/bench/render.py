@@ -13,6 +13,7 @@ from ..camera import Camera, read_camera
 from ..capture import read_capture
 from ..draw import Drawing, Player
 from ..errors import HoloreelError
+from ..gaussians.decoder import Activation
 from ..render import Backend
 from ..render.contract import Rules
 
@@ -49,14 +50,22 @@ class Result:
         return asdict(self) | {"gain": self.gain}
 
 
-def measure(path: Path, view: Path, size: tuple[int, int] | None = None, backend: Backend = "auto") -> Result:
-    """Draw all frames of a file as the camera `view` (a CAMERA.json, or a capture: its first camera) sees them.
+def measure(
+    path: Path,
+    view: Path | Camera,
+    size: tuple[int, int] | None = None,
+    backend: Backend = "auto",
+    decoder_output: Activation | None = None,
+) -> Result:
+    """Draw all frames of a file as a camera sees them: `view`, or its CAMERA.json, or a capture's first camera.
+
+    `decoder_output` is as in `core.reel.load_gaussians`.
 
     Both ways take turns, pass by pass, so that a busy machine is busy for both. Raises `HoloreelError` where a frame is
     not the same both ways.
     """
-    player = Player(path, backend)
-    camera = _camera(view)
+    player = Player(path, backend, decoder_output)
+    camera = view if isinstance(view, Camera) else _camera(view)
     if size:
         camera = camera.scaled(*size)
     frames = [float(player.frame_start + index) for index in range(player.frame_count)]

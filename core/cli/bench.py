@@ -163,7 +163,45 @@ def seams(
         print(write_seams(result, out))
 
 
-MEASUREMENTS: dict[str, Callable[..., None]] = {"raster": raster, "train": train, "render": render, "seams": seams}
+def ablation(
+    what: Annotated[Literal["ablation"], tyro.conf.Positional],
+    scenes: tuple[Path, ...],
+    out: Path = Path("build/ablation/results"),
+    iterations: int = 2000,
+    gaussians: int = 40_000,
+    parts: tuple[str, ...] = (),
+    lpips_weights: Path | None = None,
+    lpips_heads: Path | None = None,
+    backend: Backend = "auto",
+) -> None:
+    """Train without single parts of the method and print the paper's Table 4; a call that was stopped goes on.
+
+    Args:
+        what: What each part of the method brings, on views that were held out.
+        scenes: Folders of captures with a camera held out.
+        out: Folder for the reels, ablation.json and index.html; rows that are finished there are kept.
+        iterations: Every row's budget.
+        gaussians: How many to begin with, at most.
+        parts: Rows to train, of temporal_opacity, motion, rotation, features, guided and full; without it, all.
+        lpips_weights: As for `holoreel eval`; adds LPIPS to the table.
+        lpips_heads: As for `holoreel eval`.
+        backend: What to train with.
+    """
+    from ..bench.ablation import run_ablation
+    from ..lpips import load_lpips
+
+    measures = load_lpips(lpips_weights, lpips_heads) if lpips_weights else []
+    for text in run_ablation(scenes, out, iterations, gaussians, parts, measures, get_backend(backend)):
+        print(text, flush=True)
+
+
+MEASUREMENTS: dict[str, Callable[..., None]] = {
+    "raster": raster,
+    "train": train,
+    "render": render,
+    "ablation": ablation,
+    "seams": seams,
+}
 
 
 def parse_size(text: str) -> tuple[int, int]:

@@ -3,16 +3,22 @@
 
 import sys
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Literal
 
 import tyro
 from tqdm import tqdm
 
-from ..capture import read_capture
+from ..capture import CaptureOptions, read_capture
 from ..draw import Backend, Drawing
+from ..errors import HoloreelError
 from ..evaluate import evaluate
 from ..files import write_json
+from ..gaussians.decoder import Activation
 from ..images import picture_path, write_png
+from ..lpips import InputRange, Lpips, load_lpips
+from ..report.evaluation import as_text, merge, write_page
+
+NO_LPIPS = "LPIPS was not measured: it needs network weights that are not part of Holoreel (--lpips-weights)."
 
 
 def run(
@@ -22,19 +28,34 @@ def run(
     split: Literal["test", "train", "all"] = "test",
     out: Path | None = None,
     pictures: bool = True,
+    speed: bool = False,
+    json: Path | None = None,
+    lpips_weights: Path | None = None,
+    lpips_heads: Path | None = None,
+    lpips_input: InputRange = "paper",
+    decoder_output: Activation | None = None,
     backend: Backend = "auto",
+    options: Annotated[CaptureOptions, tyro.conf.arg(name="")] = CaptureOptions(),  # noqa: B008
 ) -> None:
-    """Measure PSNR, SSIM, DSSIM1 and DSSIM2 per camera and frame.
+    """Measure PSNR, SSIM, DSSIM1, DSSIM2 and, with weights, LPIPS per camera and frame; the model's size and its speed.
 
     Args:
-        file: the .reel, .ply or .splatv.
-        capture: folder with transforms.json, or that file.
+        file: the .reel, .ply, .stgc or .splatv.
+        capture: folder of a capture in any layout that `holoreel info` knows.
         split: which cameras of the capture.
-        out: folder for metrics.json and the drawn pictures (OUT/CAMERA/FRAME.png); without it, only the table is shown.
+        out: folder for metrics.json, a page index.html and the drawn pictures (OUT/CAMERA/FRAME.png).
         pictures: write the drawn pictures too.
+        speed: measure frames per second too, by the authors' protocol and by ours.
+        json: add the result to this file, under the capture's name: one file for the scenes of a dataset, with means.
+        lpips_weights: torchvision's alexnet-*.pth and/or vgg16-*.pth (or .safetensors): their folder, or one of them.
+        lpips_heads: folder with the linear weights alex.pth and vgg.pth, if they are neither there nor installed.
+        lpips_input: paper gives the networks pictures in [0, 1], standard in [-1, 1].
+        decoder_output: what the decoder of a bare .ply with a .pt beside it ends in; sigmoid without it.
         backend: which rasterizer.
+        options: how the capture is read.
     """
-    recording = read_capture(capture)
+    recording = read_capture(capture, options)
+    measures = _lpips(lpips_weights, lpips_heads, lpips_input)
 
     def keep(camera: str, frame: int, drawing: Drawing) -> None:
         if out and pictures:
@@ -46,19 +67,27 @@ def run(
             bar.total = total
             bar.update(done - bar.n)
 
-        metrics = evaluate(file, recording, split, backend, show, keep)
-    print(table(metrics))
+        metrics = evaluate(file, recording, split, backend, show, keep, decoder_output, measures)
+    if speed:
+        from ..bench.render import measure
+
+        name = recording.views(None if split == "all" else split)[0][0]
+        metrics["speed"] = measure(file, recording.cameras[name], None, backend, decoder_output).as_dict()
+    print(as_text(metrics))
+    if not measures:
+        print(NO_LPIPS)
     if out:
         write_json(out / "metrics.json", metrics)
         print(out / "metrics.json")
+        print(write_page(out / "index.html", metrics))
+    if json:
+        merge(json, metrics)
+        print(json)
 
 
-def table(metrics: dict[str, Any]) -> str:
-    """Return the means per camera, and over all pictures, as lines of text."""
-    rows = [*metrics["cameras"].items(), ("mean", metrics["mean"])]
-    width = max(len(name) for name, _ in rows)
-    lines = [f"{'':{width}}  PSNR dB    SSIM  DSSIM1  DSSIM2"]
-    lines += [
-        f"{name:{width}}  {m['psnr']:7.2f}  {m['ssim']:.4f}  {m['dssim1']:.4f}  {m['dssim2']:.4f}" for name, m in rows
-    ]
-    return "\n".join(lines)
+def _lpips(weights: Path | None, heads: Path | None, input_range: InputRange) -> list[Lpips]:
+    if weights is None:
+        if heads is not None:
+            raise HoloreelError(f"--lpips-heads {heads}: it is of no use without --lpips-weights; give both.")
+        return []
+    return load_lpips(weights, heads, input_range)

@@ -2,15 +2,19 @@
 """`holoreel eval`: a reel measured against pictures of itself, and against others'."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
+from holoreel.core import evaluate as evaluation
 from holoreel.core.capture import read_capture
 from holoreel.core.cli import main
-from holoreel.core.evaluate import evaluate
+from holoreel.core.evaluate import evaluate, model_size, valid_pixels
+from holoreel.core.gaussians.decoder import Decoder, write_pt
+from holoreel.core.gaussians.ply import write_ply
 from holoreel.core.images import read_image
 from holoreel.core.metrics import score
-from holoreel.core.reel import save_gaussians
+from holoreel.core.reel import SegmentPayload, load_gaussians, save_gaussians, write_segments
 
 
 def test_the_truth_scores_what_8_bits_allow(recording, tmp_path, capsys):
@@ -90,3 +94,106 @@ def test_mistakes_get_a_sentence(recording, tmp_path, capsys):
     assert main(["eval", str(recording.reel), str(tmp_path)]) == 2
     assert "no pictures in the split 'test'" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
+
+
+def test_sizes_count_every_payload(recording, tmp_path):
+    """Two segments with decoders, whose files are as large as they are told to be."""
+    decoder = Decoder(np.zeros((6, 12)), np.zeros((3, 6)), "none")
+    model = make_full(recording.model)
+    reel = write_segments(
+        tmp_path / "two.reel",
+        [SegmentPayload(model, decoder, 101, 2), SegmentPayload(model.take([0, 1]), decoder, 103, 1)],
+        fps=24.0,
+        frame_start=101,
+    )
+    files = [*tmp_path.glob("*.ply"), *tmp_path.glob("*.safetensors")]
+    assert len(files) == 4
+    size = model_size(load_gaussians(reel.path))
+    total = sum(file.stat().st_size for file in files)
+    assert size["bytes"] == total
+    assert size["bytes_per_frame"] == pytest.approx(total / 3, abs=0.1)
+    assert size["bytes_per_300_frames"] == pytest.approx(total * 100, abs=1)
+
+
+def test_a_bare_models_decoder_ends_as_it_is_told(recording, tmp_path):
+    ply = tmp_path / "point_cloud.ply"
+    write_ply(ply, make_full(recording.model))
+    write_pt(tmp_path / "point_cloud.pt", Decoder(np.zeros((6, 12)), np.zeros((3, 6)), "sigmoid"))
+    capture = read_capture(recording.capture)
+    drawn: dict = {None: [], "sigmoid": [], "clamp": []}
+    for output, pictures in drawn.items():
+        metrics = evaluate(
+            ply, capture, "test", "reference", None, lambda *view, to=pictures: to.append(view[2].image), output
+        )
+    np.testing.assert_array_equal(drawn[None], drawn["sigmoid"])
+    np.testing.assert_allclose(drawn["sigmoid"], 1 / (1 + np.exp(-np.array(drawn["clamp"]))), atol=1e-6)
+    size = sum(file.stat().st_size for file in tmp_path.iterdir())
+    assert metrics["size"]["bytes"] == size
+
+
+def test_pixels_out_of_a_lens_reach_do_not_count(recording, monkeypatch):
+    """With half of the picture out of reach, the score is that of the other half."""
+    capture = read_capture(recording.capture)
+    half = np.zeros((24, 32), bool)
+    half[:, 16:] = True
+    monkeypatch.setattr(evaluation, "valid_pixels", lambda camera: half)
+    model = recording.model.take([0])
+    model.opacity_logits[:] = -30.0
+    reel = recording.folder / "out" / "gray-half.reel"
+    save_gaussians(reel, model, fps=24, frame_start=101, frame_count=3, background=(0.5, 0.5, 0.5))
+    shown = []
+
+    class Spy:
+        name, input_range = "lpips_alex", "paper"
+
+        def __call__(self, image, truth):
+            shown.append((image, truth))
+            return 0.25
+
+    metrics = evaluate(reel, capture, "test", "reference", lpips=[Spy()])
+    truth = read_image(recording.folder / "pictures" / "right" / "0101.png")
+    expected = -10 * np.log10(np.mean((truth[:, 16:] - 0.5) ** 2))
+    assert metrics["views"][0]["psnr"] == pytest.approx(expected, abs=1e-4)
+    assert metrics["mean"]["lpips_alex"] == 0.25
+    assert metrics["lpips_input"] == "paper"
+    image, picture = shown[0]
+    np.testing.assert_array_equal(image[:, :16], picture[:, :16])
+    np.testing.assert_allclose(image[:, 16:], 0.5)
+
+
+def test_only_distorted_lenses_are_masked(recording):
+    camera = recording.cameras["left"]
+    assert valid_pixels(camera) is None
+    fisheye = replace(camera, model="OPENCV_FISHEYE", fx=8.0, fy=8.0, distortion=(0.0, 0.0, 0.0, 0.0))
+    valid = valid_pixels(fisheye)
+    assert valid.shape == (24, 32)
+    assert valid[12, 16]
+    assert not valid[0, 0]  # 143 degrees off the axis: behind the lens
+
+
+def test_scenes_are_merged_and_pages_written(recording, tmp_path, capsys):
+    reel, capture, merged = str(recording.reel), str(recording.capture), tmp_path / "all.json"
+    command = ["eval", reel, capture, "--out", str(tmp_path / "out"), "--backend", "reference", "--json", str(merged)]
+    assert main([*command, "--speed"]) == 0
+    said = capsys.readouterr().out
+    assert "LPIPS was not measured" in said
+    assert "frames per second" in said
+    page = (tmp_path / "out" / "index.html").read_text()
+    metrics = json.loads((tmp_path / "out" / "metrics.json").read_text())
+    assert all(text in page for text in ("DSSIM2", "<td>103</td>", f"{metrics['frames']['103']['psnr']:.2f}"))
+    other = json.loads(merged.read_text())
+    scene = next(iter(other["scenes"].values()))
+    other["scenes"]["worse"] = {**scene, "mean": {name: value - 10 for name, value in scene["mean"].items()}}
+    merged.write_text(json.dumps(other))
+    assert main(command) == 0
+    result = json.loads(merged.read_text())
+    assert len(result["scenes"]) == 2
+    assert result["mean"]["psnr"] == pytest.approx(metrics["mean"]["psnr"] - 5, abs=1e-5)
+    merged.write_text('{"scenes": [1]}')
+    assert main(command) == 2
+    assert "name another file with --json" in capsys.readouterr().err
+
+
+def make_full(model):
+    features = np.concatenate([model.features, np.zeros((len(model), 6), np.float32)], axis=1)
+    return replace(model, features=features)
