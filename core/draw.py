@@ -107,6 +107,7 @@ class Player:
         segment, time = reel.locate(frame) if reel else (0, self.first.time_of(frame))
         gaussians, decoder = self._segment(segment)
         color = self.first.background if background is None else background
+        rules = rules or (Rules(near=reel.near) if reel else None)
         return draw(gaussians, time, camera, self.backend, color, decoder, rules)
 
     def _load(self, segment: int) -> tuple[SpacetimeTensors, DecoderTensors | None]:

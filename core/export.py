@@ -15,7 +15,7 @@ from .gaussians.flat import flattened
 from .gaussians.ply import write_ply
 from .gaussians.splat3d import write_moment
 from .gaussians.splatv import write_splatv
-from .reel import Loaded, SegmentPayload, load_gaussians, write_segments
+from .reel import NEAR, Loaded, SegmentPayload, load_gaussians, write_segments
 
 Form = Literal["splatv", "3dgs", "ply", "compact"]
 ENDINGS: dict[Form, tuple[str, ...]] = {
@@ -135,6 +135,7 @@ def export_reel(source: Source, out: Path, suffix: str, segment: int | None = No
         up=first.up,
         background=first.background,
         viewpoint=first.viewpoint,
+        near=first.reel.near if first.reel else NEAR,
         provenance=first.reel.provenance if first.reel else {"file": source.path.name},
         suffix=suffix,
     )

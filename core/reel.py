@@ -8,7 +8,7 @@ A reel is a JSON file `NAME.reel` that ties together payload files beside it (or
      "variant": "full", "decoder": {"output": "sigmoid", "viewpoint": [x, y, z]},
      "segments": [{"file": "NAME.000.ply", "frame_start": 1, "frame_count": 50,
                    "decoder": "NAME.000.decoder.safetensors"}, ...],
-     "files": {"metrics": "metrics.json"}, "provenance": {...}}
+     "near": 0.2, "files": {"metrics": "metrics.json"}, "provenance": {...}}
 
 Segments follow each other without gap. Frame j of a segment's F frames has the normalized time j / F, in [0, 1). A lite
 reel has `decoder` null, and its segments have none.
@@ -33,6 +33,7 @@ UP_AXES = ("X", "-X", "Y", "-Y", "Z", "-Z")
 COLOR_SPACES = ("display",)  # colors are sRGB as displayed: what was seen in the 8-bit pictures, divided by 255
 BARE_FRAME_COUNT = 50  # what the authors train on, and assumed where a file does not say
 BARE_FPS = 30.0
+NEAR = 0.2  # what the authors draw with, and assumed where a manifest does not say
 
 SEGMENT_SUFFIXES = (".ply", ".stgc")  # payloads that a segment may have
 _SUFFIX_WORDS = " or ".join(SEGMENT_SUFFIXES)
@@ -71,7 +72,8 @@ class Reel:
     `bounds` is the box of the visible Gaussians' centers (lowest, highest corner), `up` the world axis that points up
     (None where unknown), `background` the color the Gaussians were trained over. `decoder_output` is the activation
     that the segments' decoders end in (None where there are none), `viewpoint` the place from which a full model's
-    colors are taken where only one for each Gaussian can be shown. `files` names further files by purpose (`config`,
+    colors are taken where only one for each Gaussian can be shown. Gaussians nearer to the camera than `near` are not
+    drawn: it was so in training. `files` names further files by purpose (`config`,
     `metrics`, `log`); `provenance` is free.
     """
 
@@ -87,6 +89,7 @@ class Reel:
     background: Triple = (0.0, 0.0, 0.0)
     decoder_output: Activation | None = None
     viewpoint: Triple | None = None
+    near: float = NEAR
     files: dict[str, str] = field(default_factory=dict)
     provenance: dict[str, Any] = field(default_factory=dict)
 
@@ -227,6 +230,7 @@ def write_segments(
     up: str | None = None,
     background: Triple = (0.0, 0.0, 0.0),
     viewpoint: Triple | None = None,
+    near: float = NEAR,
     files: dict[str, str] | None = None,
     provenance: dict[str, Any] | None = None,
     suffix: str = ".ply",
@@ -266,6 +270,7 @@ def write_segments(
         background=background,
         decoder_output=outputs[0] if outputs else None,
         viewpoint=viewpoint if outputs else None,
+        near=near,
         files=files or {},
         provenance=provenance or {},
     )
@@ -329,6 +334,7 @@ def write_reel(reel: Reel) -> None:
         "background": reel.background,
         "variant": reel.variant,
         "decoder": _decoder_json(reel),
+        "near": reel.near,
         "segments": [{k: v for k, v in vars(part).items() if v is not None} for part in reel.segments],
         "files": reel.files,
         "provenance": reel.provenance,
@@ -378,6 +384,7 @@ def read_reel(path: str | Path) -> Reel:
         background=_parse_triple(path, "background", manifest.get("background", (0.0, 0.0, 0.0))),
         decoder_output=decoder.get("output"),
         viewpoint=None if viewpoint is None else _parse_triple(path, "decoder.viewpoint", viewpoint),
+        near=manifest.get("near", NEAR),
         files=manifest.get("files", {}),
         provenance=manifest.get("provenance", {}),
     )
@@ -403,6 +410,7 @@ def check_reel(reel: Reel) -> None:
     )
     demand(reel.variant in ("lite", "full"), "variant", reel.variant, "'lite' or 'full'")
     demand(reel.variant == "full" or reel.decoder_output is None, "decoder", reel.decoder_output, "null in a lite reel")
+    demand(_is_number(reel.near) and reel.near > 0, "near", reel.near, "a positive number")
     demand(reel.up is None or reel.up in UP_AXES, "up", reel.up, f"null or one of {', '.join(UP_AXES)}")
     demand(reel.color_space in COLOR_SPACES, "color_space", reel.color_space, f"one of {', '.join(COLOR_SPACES)}")
     demand(isinstance(reel.provenance, dict), "provenance", reel.provenance, "an object")

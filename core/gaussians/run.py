@@ -158,6 +158,7 @@ def _finish(trainer: Trainer, plan: SegmentPlan, capture: Capture) -> _Finished:
         "frame_start": payload.frame_start,
         "frame_count": payload.frame_count,
         "gaussians": len(gaussians),
+        "near": trainer.rules.near,
         "seconds": round(trainer.seconds, 2),
         "history": [list(row) for row in trainer.history],
     }
@@ -273,6 +274,7 @@ def _write_result(capture: Capture, config: TrainConfig, finished: list[_Finishe
         up="Z",
         background=config.background,
         viewpoint=_middle_of(capture),
+        near=min(done.record["near"] for done in finished),
         files={"config": paths.record.name},
         provenance={"capture": name, "iterations": config.iterations},
     )

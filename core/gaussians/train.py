@@ -119,7 +119,7 @@ class Trainer:
                 f"{capture.source}: the capture has no seed points; make them of its pictures with `holoreel sfm`, or "
                 "synthesize it with --seed-points."
             )
-        self.device: str = getattr(backend, "DEVICE", "cpu")
+        self.device: str = backend.DEVICE
         self.scene = measure_scene(capture, xyz).to(self.device)
         self.measure = self.scene.footprints if config.unit == "footprint" else self.scene.extents
         # Ray origins are the network's one input in world units; this makes them comparable with the others.
