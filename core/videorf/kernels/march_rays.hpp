@@ -194,12 +194,18 @@ template <bool kSlope> HOLOREEL_INLINE void activate(Batch& batch, float step) {
     }
 }
 
+// Asks for the rows of a batch that will be sampled soon: they lie all over the table.
+template <int C> HOLOREEL_INLINE void fetch(const March& march, const Batch& batch) {
+    const int32_t* corners = march.volume->rows_of.data();
+    for (int i = 0; i < batch.count; i++)
+        for (int along : {0, kStrideX})
+            for (int offset : {0, 1, kStrideY, kStrideY + 1})
+                __builtin_prefetch(march.table + size_t(corners[batch.corner[i] + along + offset]) * C);
+}
+
 template <int C, bool kSlope, class Rows>
 HOLOREEL_INLINE void sample(const March& march, Batch& batch, Rows& rows) {
     const int32_t* corners = march.volume->rows_of.data();
-    for (int i = 0; i < batch.count; i++)
-        for (int offset : {0, 1, kStrideY, kStrideY + 1, kStrideX, kStrideX + 1, kStrideX + kStrideY, kStrideX + kStrideY + 1})
-            __builtin_prefetch(march.table + size_t(corners[batch.corner[i] + offset]) * C);
     for (int i = 0; i < batch.count; i++)
         rows[i] = interpolate<C>(march.table, corners + batch.corner[i], batch.x[i], batch.y[i], batch.z[i]);
     for (int i = 0; i < kBatch; i++) batch.density[i] = i < batch.count ? rows[i][0] : 0.0f;
@@ -211,15 +217,21 @@ HOLOREEL_INLINE int64_t march_run(const March& march, int64_t first, int64_t las
     using Row = typename RowOf<C>::type;
     const float least = static_cast<float>(march.rays.transmittance_min);
     int64_t samples = 0;
-    Batch batch;
+    Batch batches[2];
     Row rows[kBatch];
     for (int64_t ray = first; ray < last; ray++) {
         Walk walk(*march.volume, march.rays, ray);
         const float entry = static_cast<float>(walk.entry);
         Row sum = {};
         float left = 1, distance = 0;
-        bool open = true;
-        while (open && walk.next(batch)) {
+        int now = 0;
+        bool open = true, more = walk.next(batches[0]);
+        if (more) fetch<C>(march, batches[0]);
+        while (open && more) {
+            Batch& batch = batches[now];
+            now ^= 1;
+            more = walk.next(batches[now]);
+            if (more) fetch<C>(march, batches[now]);
             sample<C, kTape>(march, batch, rows);
             int taken = 0;
             for (; taken < batch.count && open; taken++) {
