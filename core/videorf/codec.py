@@ -165,13 +165,13 @@ def _decode(data: bytes, picture: tuple[int, int] | None) -> Iterator[NDArray[np
                     raise ValueError("its pictures change their size")
                 plane = frame.planes[0]
                 rows = np.frombuffer(memoryview(plane), np.uint8).reshape(-1, plane.line_size)
-                yield np.ascontiguousarray(rows[: frame.height, : frame.width])
+                yield rows[: frame.height, : frame.width].copy()
     except (av.error.FFmpegError, IndexError) as error:
         raise ValueError(f"it does not decode ({error})") from error
 
 
 class FeatureVideo:
-    """Any luma of a feature video, in any order; frames in order cost one decode each."""
+    """Any luma of a feature video, in any order; frames in order cost one decode each, the same one again none."""
 
     def __init__(self, path: Path, video: CodedVideo, picture: tuple[int, int]) -> None:
         """Open a video whose lumas are `picture` (height, width). Raises `HoloreelError` where the file is missing."""
@@ -183,6 +183,7 @@ class FeatureVideo:
         self._group: CodedGroup | None = None
         self._frames: Iterator[NDArray[np.uint8]] = iter(())
         self._next = 0
+        self._latest: NDArray[np.uint8] | None = None
 
     def missing(self) -> list[CodedGroup]:
         """Return the groups that a file cut off does not hold in full; the others can be played."""
@@ -197,6 +198,8 @@ class FeatureVideo:
         group = next((group for group in self.video.groups if 0 <= frame - group.first < group.frames), None)
         if group is None:
             raise HoloreelError(f"{self.path} has no frame {frame}: take 0 to {self._count() - 1}.")
+        if group is self._group and frame == self._next - 1 and self._latest is not None:
+            return self._latest
         if group is not self._group or frame < self._next:
             self._start(group)
         try:
@@ -208,6 +211,7 @@ class FeatureVideo:
                 if self._next == group.first + 1 and zlib.crc32(luma.tobytes()) != group.luma_crc32:
                     raise ValueError("its decoded luma is not the one that was encoded")
                 if self._next > frame:
+                    self._latest = luma
                     return luma
         except ValueError as error:
             self._group = None
@@ -228,7 +232,7 @@ class FeatureVideo:
             raise HoloreelError(
                 f"{self.path} is not the file that was encoded{self._suspicion()}: fetch the original file."
             )
-        self._group, self._next = group, group.first
+        self._group, self._next, self._latest = group, group.first, None
         self._frames = _decode(head + part, self.picture)
 
     def _read(self, span: Span) -> bytes:

@@ -112,6 +112,7 @@ def test_any_frame_decodes_to_what_all_frames_in_order_do(tmp_path, codec):
     anywhere = FeatureVideo(tmp_path / "a.mp4", coded, PICTURE)
     for frame in (7, 0, 2, 2, 1, 4, 5, 6, 3):
         assert (anywhere.luma(frame) == decoded[frame]).all()
+    assert anywhere.luma(3) is anywhere.luma(3)  # not decoded again
     with pytest.raises(HoloreelError, match="no frame 8: take 0 to 7"):
         anywhere.luma(8)
 
