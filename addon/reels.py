@@ -92,8 +92,8 @@ def report_of(loaded: Loaded) -> list[str]:
     """Say in sentences what was assumed, what is unusual, and what will not be shown."""
     report = list(loaded.report)
     if loaded.decoder is not None:
-        place = "from no place in particular" if loaded.viewpoint is None else "as seen from the reel's viewpoint"
-        report.append(f"A full model: each Gaussian shows one color, decoded {place} (an approximation).")
+        how = "of its base" if loaded.viewpoint is None else "decoded as seen from the reel's viewpoint"
+        report.append(f"A full model: each Gaussian shows one color, {how} (an approximation).")
     if loaded.reel is not None and len(loaded.reel.segments) > 1:
         report.append(f"The first of {len(loaded.reel.segments)} segments is shown.")
     return report

@@ -50,7 +50,10 @@ def run(
     for sentence in source.first.report:
         print(f"note: {sentence}", file=sys.stderr)
     if source.first.decoder and source.viewpoint is None and to in ("splatv", "3dgs"):
-        print("note: no viewpoint is known: the decoder sees no ray; name one with --camera.", file=sys.stderr)
+        print(
+            "note: no viewpoint is known, so colors are those of the base alone; name one with --camera.",
+            file=sys.stderr,
+        )
     if to == "3dgs":
         write_moments(source, chosen, out, many=frames is not None)
     elif to == "splatv":

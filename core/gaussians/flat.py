@@ -3,7 +3,7 @@
 
 The decoder belongs to pixels: it sees features that were blended, and each pixel's own ray. Here it is run once for
 each Gaussian, on that Gaussian's own features and the ray that meets it from one viewpoint. Where an opaque Gaussian
-fills a pixel seen from there, this is the pixel's color; elsewhere it is near it.
+fills a pixel seen from there, this is the pixel's color; elsewhere it is near it. Without a viewpoint, the activation of the base color is nearer than any made-up ray.
 """
 
 from dataclasses import replace
@@ -23,24 +23,24 @@ def flat_colors(
 ) -> NDArray[np.float32]:
     """Return display-referred colors (N, 3): a lite model's own, a full one's decoded, or its base without a decoder.
 
-    `viewpoint` is where rays come from, in the world; without one the decoder gets zeros for the ray. `time` is the
+    `viewpoint` is where rays come from, in the world; without one the network adds nothing to the base. `time` is the
     normalized time to decode at; without one each Gaussian is decoded at its temporal center.
     """
     if decoder is None or gaussians.variant == "lite":
         return gaussians.features[:, :3]
+    if viewpoint is None:
+        base = np.pad(gaussians.features[:, :3], ((0, 0), (0, 6)))
+        return decoder.decode(base, np.zeros(3), np.zeros(3)).astype(np.float32)
     if time is None:
         means, features = gaussians.means, gaussians.features.copy()
         features[:, 6:] = 0.0
     else:
         evaluated = gaussians.evaluate(time)
         means, features = evaluated.means, evaluated.features
-    if viewpoint is None:
-        origins = directions = np.zeros(3)
-    else:
-        origins = np.asarray(viewpoint, np.float64)
-        away = means - origins
-        distance = np.linalg.norm(away, axis=1, keepdims=True)
-        directions = away / np.where(distance > 0, distance, 1.0)
+    origins = np.asarray(viewpoint, np.float64)
+    away = means - origins
+    distance = np.linalg.norm(away, axis=1, keepdims=True)
+    directions = away / np.where(distance > 0, distance, 1.0)
     return decoder.decode(features, origins, directions).astype(np.float32)
 
 
