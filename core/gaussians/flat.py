@@ -3,7 +3,8 @@
 
 The decoder belongs to pixels: it sees features that were blended, and each pixel's own ray. Here it is run once for
 each Gaussian, on that Gaussian's own features and the ray that meets it from one viewpoint. Where an opaque Gaussian
-fills a pixel seen from there, this is the pixel's color; elsewhere it is near it. Without a viewpoint, the activation of the base color is nearer than any made-up ray.
+fills a pixel seen from there, this is the pixel's color; elsewhere it is near it. Without a viewpoint, the activation
+of the base color is nearer than any made-up ray.
 """
 
 from dataclasses import replace
