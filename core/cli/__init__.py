@@ -32,9 +32,16 @@ def usage() -> str:
 
 def main(arguments: list[str] | None = None) -> int:
     """Run one command; return the exit status (2 for anything the user can mend)."""
-    arguments = sys.argv[1:] if arguments is None else arguments
+    try:
+        return _main(sys.argv[1:] if arguments is None else arguments)
+    except BrokenPipeError:  # whoever read our output has seen enough
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 0
+
+
+def _main(arguments: list[str]) -> int:
     if not arguments or arguments[0] in ("-h", "--help"):
-        print(usage())
+        print(usage(), flush=True)
         return 0 if arguments else 2
     name, rest = arguments[0], arguments[1:]
     if name not in COMMANDS:
@@ -46,12 +53,10 @@ def main(arguments: list[str] | None = None) -> int:
     try:
         command = module.prepare(rest) if hasattr(module, "prepare") else module.run
         tyro.cli(command, prog=f"holoreel {name}", args=rest)
+        sys.stdout.flush()
     except HoloreelError as error:
         print(f"holoreel {name}: {error}", file=sys.stderr)
         return 2
-    except BrokenPipeError:  # whoever read our output has seen enough
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return 0
     except KeyboardInterrupt:
         print(f"\nholoreel {name}: stopped.", file=sys.stderr)
         return 130
