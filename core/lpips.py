@@ -129,9 +129,8 @@ class Lpips:
                 f"{image.shape[1]}x{image.shape[0]}: render larger ones, or leave --lpips-weights away."
             )
         with torch.no_grad():
-            return distance(
-                *(features(self._prepare(x), self.network, self.weights) for x in (image, truth)), self.heads
-            )
+            first, second = (features(self._prepare(x), self.network, self.weights) for x in (image, truth))
+            return distance(first, second, self.heads)
 
     def _prepare(self, image: NDArray[np.floating]) -> Tensor:
         pixels = torch.from_numpy(np.clip(image, 0.0, 1.0).astype(np.float32)).permute(2, 0, 1)[None]
