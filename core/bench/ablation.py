@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..capture import Capture, read_capture
+from ..capture.media import VideoFrame
 from ..draw import Drawing
 from ..errors import HoloreelError
 from ..evaluate import evaluate
@@ -123,9 +124,8 @@ def ablate(
 def fingerprint(capture: Capture) -> str:
     """Return a digest of what a run depends on: cameras, splits, and the pictures' and seeds' sizes and times."""
     text = [repr((name, camera.to_json(), capture.split(name))) for name, camera in capture.cameras.items()]
-    files = sorted(
-        {Path(getattr(media, "path", media)) for media in (*capture.images.values(), *capture.seeds.values())}
-    )
+    pictures = (media.path if isinstance(media, VideoFrame) else media for media in capture.images.values())
+    files = sorted({*pictures, *capture.seeds.values()})
     text += [f"{path.name} {(state := path.stat()).st_size} {state.st_mtime_ns}" for path in files]
     return hashlib.sha256("\n".join([str(capture.frame_count), *text]).encode()).hexdigest()
 
