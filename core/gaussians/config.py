@@ -37,7 +37,7 @@ class LearningRates:
     """segments"""
     trbf_scales: float = 0.04
     """log width"""
-    decoder: float = 2e-3
+    decoder: float = 0.01
     """weights of a full model's network"""
     final_factor: float = 0.1
     """all rates but that of the positions decay to this part of themselves"""
