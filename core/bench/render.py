@@ -28,7 +28,7 @@ class Speed:
     fps: float
     """1 / median over all frames of all passes, when each had been drawn before"""
     authors_fps: float
-    """mean over the frames that count: in each of 4 passes all but the first 11"""
+    """1 / mean over the frames that count: in each of 4 passes all but the first 11"""
 
 
 @dataclass
@@ -83,9 +83,9 @@ def measure(
 
 def _speed(passes: list[list[float]]) -> Speed:
     dropped = DROPPED if len(passes[0]) > DROPPED else 0
-    counted = [1.0 / seconds for one in passes for seconds in one[dropped:]]
+    counted = [seconds for one in passes for seconds in one[dropped:]]
     middle = statistics.median(seconds for one in passes for seconds in one)
-    return Speed(1.0 / middle, statistics.mean(counted))
+    return Speed(1.0 / middle, 1.0 / statistics.mean(counted))
 
 
 def _time(player: Player, camera: Camera, frame: float, rules: Rules) -> float:

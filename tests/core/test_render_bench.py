@@ -5,6 +5,7 @@ import json
 
 import pytest
 from holoreel.core.bench import raster as bench
+from holoreel.core.bench import render
 from holoreel.core.bench import train as train_bench
 from holoreel.core.cli import main
 
@@ -68,8 +69,16 @@ def test_frames_per_second_of_a_reel(recording, view, tmp_path, capsys):
     assert "--size 64" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("arguments", [["--help"], ["raster", "--help"], ["train", "--help"], ["seams", "--help"]])
+@pytest.mark.parametrize(
+    "arguments", [["--help"], *([what, "--help"] for what in ("raster", "train", "seams", "ablation"))]
+)
 def test_help(arguments):
     with pytest.raises(SystemExit) as stopped:
         main(["bench", *arguments])
     assert stopped.value.code == 0
+
+
+def test_the_authors_protocol_leaves_out_the_first_frames_and_averages_seconds():
+    passes = [[9.0] * 11 + [0.1, 0.3], [9.0] * 11 + [0.2, 0.2]]
+    assert render._speed(passes).authors_fps == pytest.approx(5.0)
+    assert render._speed([[0.1, 0.3]]).authors_fps == pytest.approx(5.0)  # too few frames to leave any out
