@@ -116,9 +116,9 @@ class GuidedConfig:
     """the loss is stable when it falls by less than this part of itself over a fiftieth of the run"""
     patch: int = 16
     """pixels along a side of the patches over which errors are averaged"""
-    share: float = 0.02
+    share: float = 0.01
     """at most this part of all patches is sampled"""
-    contrast: float = 2.0
+    contrast: float = 4.0
     """only patches whose error is this many times the median patch's are sampled"""
     samples: int = 8
     """new Gaussians along each ray"""
