@@ -139,7 +139,7 @@ def render(
 def seams(
     what: Annotated[Literal["seams"], tyro.conf.Positional],
     reel: Annotated[Path, tyro.conf.Positional],
-    capture: Path,
+    capture: Annotated[Path, tyro.conf.Positional],
     camera: str | None = None,
     backend: Backend = "auto",
     out: Path | None = None,
