@@ -33,7 +33,9 @@ def check_gaussians(
     _check_rest(count, features, background, density)
 
 
-def check_spacetime(gaussians: SpacetimeTensors, background: Tensor | None, density: DensityStats | None) -> None:
+def check_spacetime(
+    gaussians: SpacetimeTensors, background: Tensor | None, density: DensityStats | None, rows: Tensor | None = None
+) -> None:
     """Raise ValueError unless the arguments of `rasterize_spacetime` have the shapes of the contract."""
     g, count = gaussians, len(gaussians.means)
     _check_shapes(
@@ -47,6 +49,12 @@ def check_spacetime(gaussians: SpacetimeTensors, background: Tensor | None, dens
         trbf_log_scales=(g.trbf_log_scales, (count,)),
     )
     _check_rest(count, g.features, background, density)
+    if rows is None:
+        return
+    if rows.ndim != 1 or rows.dtype != torch.int32:
+        raise ValueError(f"rows must be an int32 list, not {rows.dtype} of shape {tuple(rows.shape)}")
+    if density is not None:
+        raise ValueError("density counts all rows: it cannot be had of a list of them")
 
 
 def check_images(image: Tensor, target: Tensor) -> None:

@@ -10,14 +10,19 @@ are differentiable with respect to every tensor argument.
         -> Rendering
         3D Gaussians: means (N,3), quats (N,4) wxyz unnormalized, scales (N,3) linear, opacities (N,) in [0,1],
         features (N,C).
-    rasterize_spacetime(gaussians: SpacetimeTensors, time, camera, background=None, rules=None, density=None)
+    rasterize_spacetime(gaussians: SpacetimeTensors, time, camera, background=None, rules=None, density=None, rows=None)
         -> Rendering
-        Spacetime Gaussians at `time` (Eqs. 6-9), evaluated and projected in one pass.
+        Spacetime Gaussians at `time` (Eqs. 6-9), evaluated and projected in one pass. `rows`, an ascending int32 (M,),
+        draws those alone (`core.render.lifetimes` lists the ones that are alive), for a cost that the others have no
+        part in; `density` cannot be had with it.
     decode(features, camera, hidden, output, activation) -> Tensor
         The colors (H,W,3) of a full model's rendering (Eqs. 10-11): features (H,W,9) are [base, direction, time],
         hidden (6,12) and output (3,6) the weights of the network, activation one of `ACTIVATIONS`. A pixel's color is
         activation(base + output · relu(hidden · [direction, time, ray origin, ray direction])), with the ray through
         the pixel's center in the world and its direction of unit length. `clamp` passes no gradient outside [0, 1].
+
+    warp(image, lens: core.render.warp.Warp) -> Tensor
+        What a lens with distortion sees (H,W,C) of the picture (H',W',C) that its virtual pinhole sees.
 
 What training needs beside them:
 

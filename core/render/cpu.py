@@ -15,6 +15,7 @@ from torch.autograd.function import once_differentiable
 
 from ..camera import Camera
 from ..errors import HoloreelError
+from . import reference
 from .checks import check_adam, check_decoder, check_gaussians, check_images, check_pinhole, check_spacetime
 from .contract import ACTIVATIONS, AdamGroup, DensityStats, PictureLoss, Rendering, Rules, SpacetimeTensors
 from .native import (
@@ -29,11 +30,13 @@ from .native import (
     CImages,
     CRules,
     CTimings,
+    CWarp,
     get_threads,
     load_kernels,
     set_lanes,
     set_threads,
 )
+from .warp import Warp
 
 DEVICE = "cpu"
 
@@ -49,6 +52,7 @@ __all__ = [
     "rasterize_spacetime",
     "set_lanes",
     "set_threads",
+    "warp",
 ]
 
 
@@ -79,12 +83,19 @@ def rasterize_spacetime(
     background: Tensor | None = None,
     rules: Rules | None = None,
     density: DensityStats | None = None,
+    rows: Tensor | None = None,
 ) -> Rendering:
     """Render Spacetime Gaussians at `time`; shapes and meanings as in `contract`. float32 on the CPU."""
     rules = rules or Rules()
     check_pinhole(camera)
-    check_spacetime(gaussians, background, density)
-    return _render(_Job(camera, rules, float(time), density), background, tuple(gaussians))
+    check_spacetime(gaussians, background, density, rows)
+    if rows is not None:
+        rows = rows.to("cpu").contiguous()
+        if torch.is_grad_enabled() and any(
+            array.requires_grad for array in (*gaussians, background) if array is not None
+        ):
+            gaussians, rows = reference.listed(gaussians, rows), None  # the kernels read a list forward only
+    return _render(_Job(camera, rules, float(time), density, rows), background, tuple(gaussians))
 
 
 @dataclass
@@ -95,6 +106,7 @@ class _Job:
     rules: Rules
     time: float | None
     density: DensityStats | None
+    rows: Tensor | None = None
 
     def c_rules(self) -> CRules:
         r = self.rules
@@ -107,7 +119,12 @@ class _Job:
         features = arrays[PARAMETERS.index("features")]
         assert features is not None
         spacetime = self.time is not None
-        return CGaussians(len(features), features.shape[1], spacetime, self.time or 0.0, *map(_address, arrays))
+        listed = 0 if self.rows is None else len(self.rows)
+        return CGaussians(
+            *(len(features), features.shape[1], spacetime, self.time or 0.0),
+            *map(_address, (*arrays, self.rows)),
+            listed,
+        )
 
 
 class _Frame:
@@ -266,6 +283,56 @@ class _Decode(torch.autograd.Function):
         if status != 0:
             raise HoloreelError(f"The gradient cannot be computed: {library.holoreel_last_error().decode()}.")
         return d_features, None, d_hidden, d_output, None
+
+
+def warp(image: Tensor, lens: Warp) -> Tensor:
+    """Return what a lens sees of its pinhole's picture; as in `contract`. float32; 1 to 16 channels."""
+    lens.check(image)
+    return _WarpPicture.apply(_plain(image), lens)
+
+
+class _WarpPicture(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, image: Tensor, lens: Warp) -> Tensor:
+        picture = _memory.empty(*lens.valid.shape, image.shape[2])
+        library = load_kernels()
+        if library.holoreel_warp(_c_warp(lens, image.shape[2]), _address(image), _address(picture)) != 0:
+            raise HoloreelError(f"The picture cannot be warped: {library.holoreel_last_error().decode()}.")
+        ctx.lens, ctx.shape = lens, image.shape
+        return picture
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None]:
+        incoming, outgoing = _plain(gradient), _memory.empty(*ctx.shape)
+        library = load_kernels()
+        described = _c_warp(ctx.lens, ctx.shape[2], _spans(ctx.lens))
+        if library.holoreel_warp_backward(described, _address(incoming), _address(outgoing)) != 0:
+            raise HoloreelError(f"The gradient cannot be computed: {library.holoreel_last_error().decode()}.")
+        return outgoing, None
+
+
+WARP_BLOCK = 64  # kWarpBlock in kernels/raster.hpp
+
+
+def _spans(lens: Warp) -> Tensor:
+    """What rows of the pinhole's picture each block of pixels looks at: found once per lens, 1/8 byte per pixel."""
+    if "spans" not in lens.kept:
+        height, width = lens.valid.shape
+        spans = torch.empty(height, -(-width // WARP_BLOCK), 2, dtype=torch.int32)
+        library = load_kernels()
+        if library.holoreel_warp_spans(_c_warp(lens, 1), _address(spans)) != 0:
+            raise HoloreelError(f"The picture cannot be warped: {library.holoreel_last_error().decode()}.")
+        lens.kept["spans"] = spans
+    return lens.kept["spans"]
+
+
+def _c_warp(lens: Warp, channels: int, spans: Tensor | None = None) -> CWarp:
+    height, width = lens.valid.shape
+    return CWarp(
+        *map(_address, (lens.places, lens.valid, spans)),
+        *(width, height, lens.pinhole.width, lens.pinhole.height, channels, lens.samples),
+    )
 
 
 def picture_loss(image: Tensor, target: Tensor, weight_dssim: float) -> PictureLoss:

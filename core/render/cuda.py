@@ -22,6 +22,7 @@ from . import cpu, reference
 from .checks import check_decoder, check_gaussians, check_pinhole, check_spacetime
 from .contract import AdamGroup, DensityStats, PictureLoss, Rendering, Rules, SpacetimeTensors
 from .reference import Gaussians3D
+from .warp import Warp
 
 DEVICE = "cuda"
 REMEDY = "install Holoreel with `pip install -e '.[cuda]'` beside a torch for CUDA and its compiler, nvcc"
@@ -68,21 +69,27 @@ def rasterize_spacetime(
     background: Tensor | None = None,
     rules: Rules | None = None,
     density: DensityStats | None = None,
+    rows: Tensor | None = None,
 ) -> Rendering:
     """Render Spacetime Gaussians at `time`; shapes and meanings as in `contract`, float32 on the GPU."""
     rules = rules or Rules()
     check_pinhole(camera)
-    check_spacetime(gaussians, background, density)
-    everything = SpacetimeTensors(*map(_there, gaussians))
-    rows = reference.alive(everything, time, rules)
-    chosen = SpacetimeTensors(*(array[rows] for array in everything))
-    return _render(reference.evaluate(chosen, time, rules), rows, camera, background, rules, density)
+    check_spacetime(gaussians, background, density, rows)
+    everything = reference.listed(SpacetimeTensors(*map(_there, gaussians)), rows)
+    living = reference.alive(everything, time, rules)
+    chosen = SpacetimeTensors(*(array[living] for array in everything))
+    return _render(reference.evaluate(chosen, time, rules), living, camera, background, rules, density)
 
 
 def decode(features: Tensor, camera: Camera, hidden: Tensor, output: Tensor, activation: str) -> Tensor:
     """Turn the features of a full model's rendering into colors; shapes and meanings as in `contract`."""
     check_decoder(features, camera, hidden, output, activation)
     return reference.decode(_there(features), camera, _there(hidden), _there(output), activation)
+
+
+def warp(image: Tensor, lens: Warp) -> Tensor:
+    """Return what a lens sees of its pinhole's picture; as in `contract`."""
+    return lens.apply(_there(image))
 
 
 def picture_loss(image: Tensor, target: Tensor, weight_dssim: float) -> PictureLoss:

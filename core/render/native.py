@@ -10,7 +10,7 @@ from pathlib import Path
 
 from ..errors import HoloreelError
 
-ABI = 7  # HOLOREEL_ABI in kernels/api.hpp
+ABI = 8  # HOLOREEL_ABI in kernels/api.hpp
 
 
 class CCamera(Structure):
@@ -60,6 +60,8 @@ class CGaussians(Structure):
         ("spacetime", c_int32),
         ("time", c_double),
         *((name, c_void_p) for name in PARAMETERS),
+        ("rows", c_void_p),
+        ("listed", c_int64),
     )
 
 
@@ -87,6 +89,15 @@ class CDecoder(Structure):
     """`HoloreelDecoder`."""
 
     _fields_ = (("hidden", c_void_p), ("output", c_void_p), ("activation", c_int32), ("unused", c_int32))
+
+
+class CWarp(Structure):
+    """`HoloreelWarp`."""
+
+    _fields_ = (
+        *((name, c_void_p) for name in ("places", "valid", "spans")),
+        *((name, c_int32) for name in ("width", "height", "source_width", "source_height", "channels", "samples")),
+    )
 
 
 class CAdamGroup(Structure):
@@ -133,6 +144,9 @@ _SIGNATURES = {
     ),
     "holoreel_decode": (c_int, (POINTER(CCamera), POINTER(CDecoder), c_void_p, c_void_p)),
     "holoreel_decode_backward": (c_int, (POINTER(CCamera), POINTER(CDecoder), *[c_void_p] * 5)),
+    "holoreel_warp_spans": (c_int, (POINTER(CWarp), c_void_p)),
+    "holoreel_warp": (c_int, (POINTER(CWarp), c_void_p, c_void_p)),
+    "holoreel_warp_backward": (c_int, (POINTER(CWarp), c_void_p, c_void_p)),
     "holoreel_adam_step": (c_int, (POINTER(CAdamGroup), c_int64, *[c_double] * 3, c_int64)),
     "holoreel_frame_free": (None, (c_void_p,)),
     "holoreel_frame_intersections": (c_int64, (c_void_p,)),

@@ -16,6 +16,7 @@ from torch.utils.checkpoint import checkpoint
 from ..camera import Camera
 from .checks import check_adam, check_decoder, check_gaussians, check_images, check_pinhole, check_spacetime
 from .contract import AdamGroup, DensityStats, PictureLoss, Rendering, Rules, SpacetimeTensors
+from .warp import Warp
 
 DEVICE = "cpu"  # where nothing says otherwise; it works wherever its arguments lie
 TILE = 16
@@ -81,17 +82,24 @@ def rasterize_spacetime(
     background: Tensor | None = None,
     rules: Rules | None = None,
     density: DensityStats | None = None,
+    rows: Tensor | None = None,
 ) -> Rendering:
     """Render Spacetime Gaussians at `time`; shapes and meanings as in `contract`."""
     rules = rules or Rules()
     check_pinhole(camera)
-    check_spacetime(gaussians, background, density)
-    rows = alive(gaussians, time, rules)
+    check_spacetime(gaussians, background, density, rows)
+    gaussians = listed(gaussians, rows)
+    living = alive(gaussians, time, rules)
 
     def at_time(chosen: Tensor) -> Gaussians3D:
         return evaluate(SpacetimeTensors(*(array[chosen] for array in gaussians)), time, rules)
 
-    return _render(at_time, rows, camera, background, rules, density)
+    return _render(at_time, living, camera, background, rules, density)
+
+
+def listed(g: SpacetimeTensors, rows: Tensor | None) -> SpacetimeTensors:
+    """Return the Gaussians of the listed rows alone, all if there is no list."""
+    return g if rows is None else SpacetimeTensors(*(array[rows.to(array.device)] for array in g))
 
 
 def alive(g: SpacetimeTensors, time: float, rules: Rules) -> Tensor:
@@ -334,6 +342,11 @@ def directions(camera: Camera, like: Tensor) -> Tensor:
     )
     local = torch.stack((*torch.meshgrid(x, y, indexing="xy"), torch.ones_like(x).expand(len(y), len(x))), 2)
     return torch.nn.functional.normalize(local, dim=2) @ turn
+
+
+def warp(image: Tensor, lens: Warp) -> Tensor:
+    """Return what a lens sees of its pinhole's picture; as in `contract`."""
+    return lens.apply(image)
 
 
 def ssim_map(image: Tensor, target: Tensor) -> Tensor:

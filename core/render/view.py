@@ -56,7 +56,7 @@ def render_view(
         rendering = _decoded(backend, rendering, warp.pinhole, decoder)
     color, alpha, depth = rendering
     # Depth is a mean weighted by alpha: both parts of the fraction are warped.
-    layers = warp.apply(torch.cat([color, alpha[..., None], (alpha * depth)[..., None]], dim=2))
+    layers = backend.warp(torch.cat([color, alpha[..., None], (alpha * depth)[..., None]], dim=2), warp)
     color, alpha, weighted = layers[..., :3], layers[..., 3].clamp(0.0, 1.0), layers[..., 4]
     seen = alpha > 0.0
     depth = torch.where(seen, weighted / torch.where(seen, alpha, 1.0), 0.0)

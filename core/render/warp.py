@@ -9,6 +9,7 @@ of one position per pixel. Everything is linear in the picture, hence differenti
 import math
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
+from typing import Any
 
 import numpy as np
 import torch
@@ -32,19 +33,21 @@ _MARGIN = 3  # virtual pixels around what is seen, for the bicubic kernel and ro
 
 @dataclass(frozen=True, eq=False)
 class Warp:
-    """How one camera's pictures come from those of its virtual pinhole."""
+    """How one camera's pictures come from those of its virtual pinhole.
+
+    `apply` is the plain torch way; `warp` of a backend does the same, on the CPU by the compiled kernels.
+    """
 
     pinhole: Camera
     valid: Tensor  # (H, W) bool, on the CPU: where the real lens sees something that the pinhole covers
     samples: int  # n
-    _places: Tensor  # (H + 2, W + 2, 2): pixel of the virtual picture, for real pixels and one around the border
-    _on_device: dict[torch.device, tuple[Tensor, Tensor]] = field(default_factory=dict)
+    places: Tensor  # (H + 2, W + 2, 2): pixel of the virtual picture, for real pixels and one around the border
+    kept: dict[Any, Any] = field(default_factory=dict)  # what was derived from the places, for the next picture
 
     def apply(self, image: Tensor) -> Tensor:
         """Warp (H', W', C), drawn by `pinhole`, to the real lens's (H, W, C); 0 where `valid` is false."""
         camera = self.pinhole
-        if image.ndim != 3 or image.shape[:2] != (camera.height, camera.width):
-            raise ValueError(f"image has shape {tuple(image.shape)}, not ({camera.height}, {camera.width}, C)")
+        self.check(image)
         places, valid = self._at(image.device)
         grid = places.to(image.dtype) * (2.0 / image.new_tensor([camera.width, camera.height])) - 1.0
         grid = _refined(grid, self.samples)
@@ -55,10 +58,16 @@ class Warp:
             picture = functional.avg_pool2d(picture, self.samples)
         return picture[0].permute(1, 2, 0) * valid[..., None]
 
+    def check(self, image: Tensor) -> None:
+        """Raise ValueError unless the image is as large as `pinhole` draws it."""
+        camera = self.pinhole
+        if image.ndim != 3 or image.shape[:2] != (camera.height, camera.width):
+            raise ValueError(f"image has shape {tuple(image.shape)}, not ({camera.height}, {camera.width}, C)")
+
     def _at(self, device: torch.device) -> tuple[Tensor, Tensor]:
-        if device not in self._on_device:
-            self._on_device[device] = self._places.to(device), self.valid.to(device)
-        return self._on_device[device]
+        if device not in self.kept:
+            self.kept[device] = self.places.to(device), self.valid.to(device)
+        return self.kept[device]
 
 
 def lens_warp(camera: Camera) -> Warp:

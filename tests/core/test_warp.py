@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Warping a virtual pinhole's picture to a real lens: where points land, gradients, what no distortion means."""
 
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 
 import numpy as np
@@ -8,9 +9,10 @@ import pytest
 import torch
 from holoreel.core.camera import Camera
 from holoreel.core.errors import HoloreelError
+from holoreel.core.render import cpu
 from holoreel.core.render.contract import Rules
 from holoreel.core.render.reference import rasterize
-from holoreel.core.render.warp import MAX_AREA, MAX_FIELD_DEGREES, lens_warp, make_warp
+from holoreel.core.render.warp import MAX_AREA, MAX_FIELD_DEGREES, Warp, lens_warp, make_warp
 
 LENSES = {
     "OPENCV": (-0.28, 0.07, 0.002, -0.003),
@@ -123,3 +125,73 @@ def test_a_lens_that_sees_nothing_is_refused() -> None:
     far_off = Camera(8, 8, 5.0, 5.0, 5000.0, 4.0, model="OPENCV", distortion=(-0.5, 0.0, 0.0, 0.0))
     with pytest.raises(HoloreelError, match="sees nothing"):
         lens_warp(far_off)
+
+
+@pytest.fixture(params=[4, 8])
+def lanes(request: pytest.FixtureRequest) -> Iterator[int]:
+    """Run with kernels of a width, if this machine has it."""
+    try:
+        cpu.set_lanes(request.param)
+    except HoloreelError as error:
+        pytest.skip(str(error))
+    yield request.param
+    cpu.set_lanes(0)
+
+
+def with_gradient(apply: Callable[[torch.Tensor], torch.Tensor], picture: torch.Tensor) -> list[torch.Tensor]:
+    """What comes out of it, and the gradient of a random sum of that."""
+    picture = picture.clone().requires_grad_()
+    seen = apply(picture)
+    incoming = torch.randn(seen.shape, generator=torch.Generator().manual_seed(1)).to(seen.dtype)
+    seen.backward(incoming)
+    assert picture.grad is not None
+    return [seen.detach(), picture.grad]
+
+
+@pytest.mark.parametrize("model", LENSES)
+@pytest.mark.parametrize("samples", [1, 2])
+@pytest.mark.parametrize("channels", [1, 3, 5, 8, 16])
+def test_kernels_do_as_torch(model: str, samples: int, channels: int, lanes: int) -> None:
+    """A fisheye so wide that part of it is not covered; widths that are no multiple of a block."""
+    view = camera(model, 203, 91, 60.0 if model == "OPENCV_FISHEYE" else 150.0)
+    warp = replace(make_warp(view), samples=samples)
+    size = (warp.pinhole.height, warp.pinhole.width, channels)
+    picture = torch.rand(size, generator=torch.Generator().manual_seed(0))
+    oracle = with_gradient(warp.apply, picture.double())
+    for ours, wanted in zip(with_gradient(lambda image: cpu.warp(image, warp), picture), oracle, strict=True):
+        assert (ours - wanted).abs().max() <= 1e-5
+    assert warp.valid.all() == (model != "OPENCV_FISHEYE")
+
+
+@pytest.mark.parametrize("samples", [1, 2])
+def test_kernels_know_the_border_of_the_picture(samples: int, lanes: int) -> None:
+    """Places beyond every border, at corners, and in the picture's last pixels."""
+    generator = torch.Generator().manual_seed(2)
+    pinhole = Camera(9, 7, 10.0, 10.0, 4.5, 3.5)
+    places = torch.rand(40, 131, 2, generator=generator) * torch.tensor([19.0, 17.0]) - 5.0
+    warp = Warp(pinhole, torch.rand(38, 129, generator=generator) < 0.8, samples, places)
+    for channels in (1, 5, 11):
+        picture = torch.rand(7, 9, channels, generator=generator)
+        oracle = with_gradient(warp.apply, picture.double())
+        for ours, wanted in zip(with_gradient(lambda image: cpu.warp(image, warp), picture), oracle, strict=True):
+            assert (ours - wanted).abs().max() <= 1e-5 * wanted.abs().max()
+
+
+def test_kernels_give_the_same_for_any_number_of_threads() -> None:
+    warp = lens_warp(camera("OPENCV_FISHEYE", 203, 150, 60.0))
+    picture = torch.rand(warp.pinhole.height, warp.pinhole.width, 5, generator=torch.Generator().manual_seed(3))
+    before, results = cpu.get_threads(), []
+    for threads in (1, 2, 5):
+        cpu.set_threads(threads)
+        results.append(with_gradient(lambda image: cpu.warp(image, warp), picture))
+    cpu.set_threads(before)
+    for result in results[1:]:
+        assert all(torch.equal(a, b) for a, b in zip(result, results[0], strict=True))
+
+
+def test_kernels_refuse_what_they_cannot_warp() -> None:
+    warp = lens_warp(camera("OPENCV"))
+    with pytest.raises(ValueError, match="not"):
+        cpu.warp(torch.ones(3, 3, 1), warp)
+    with pytest.raises(HoloreelError, match="1 to 16 channels"):
+        cpu.warp(torch.ones(warp.pinhole.height, warp.pinhole.width, 17), warp)

@@ -14,6 +14,7 @@
 #include "frame.hpp"
 #include "loss.hpp"
 #include "thread_pool.hpp"
+#include "warp.hpp"
 
 namespace holoreel {
 
@@ -63,6 +64,7 @@ void check(const HoloreelCamera& camera) {
 
 void check(const HoloreelGaussians& g, const HoloreelCamera& camera, const HoloreelRules& rules) {
     if (g.count < 0 || g.count > INT32_MAX) throw std::invalid_argument("the number of Gaussians must be under 2^31");
+    if (g.rows && (g.listed < 0 || g.listed > INT32_MAX)) throw std::invalid_argument("the list of rows is too long");
     if (g.channels < 1 || g.channels > kMaxChannels) throw std::invalid_argument("features must have 1 to 16 channels");
     check(camera);
     if (!(rules.alpha_min >= 1e-6 && rules.alpha_min < rules.alpha_max && rules.alpha_max < 1.0))
@@ -102,7 +104,7 @@ void run_tiles(const Frame& frame, TileKernel kernel, const TileJob& job) {
 void forward(const HoloreelGaussians& g, const HoloreelCamera& camera, const HoloreelRules& rules,
              const HoloreelImages& images, Frame& frame) {
     check(g, camera, rules);
-    frame.count = g.count;
+    frame.count = g.rows ? g.listed : g.count;
     frame.width = camera.width;
     frame.height = camera.height;
     frame.channels = g.channels;
@@ -126,6 +128,7 @@ void backward(const HoloreelGaussians& g, const HoloreelCamera& camera, const Ho
               const HoloreelImages& images, const HoloreelImageGradients& image_gradients,
               const HoloreelGradients& gradients, Frame& frame) {
     check(g, camera, rules);
+    if (g.rows) throw std::invalid_argument("there is no backward pass for a list of rows");
     if (g.count != frame.count || g.channels != frame.channels || camera.width != frame.width ||
         camera.height != frame.height)
         throw std::invalid_argument("the backward pass got other arrays than the forward pass");
@@ -264,4 +267,19 @@ HOLOREEL_API int holoreel_decode_backward(const HoloreelCamera* camera, const Ho
                         hidden_gradient, output_gradient);
     });
     return good ? 0 : -1;
+}
+
+// Fills the spans; returns 0, or -1 with an error text. Those in `map` may be null here and in the forward pass.
+HOLOREEL_API int holoreel_warp_spans(const HoloreelWarp* map, int32_t* spans) {
+    return guarded([&] { warp_spans(*map, active_kernels().warp, spans); }) ? 0 : -1;
+}
+
+// Returns 0, or -1 with an error text; `source` (H', W', C) becomes `image` (H, W, C).
+HOLOREEL_API int holoreel_warp(const HoloreelWarp* map, const float* source, float* image) {
+    return guarded([&] { warp(*map, active_kernels().warp, source, image); }) ? 0 : -1;
+}
+
+// Returns 0, or -1 with an error text. Overwrites the gradient of the source.
+HOLOREEL_API int holoreel_warp_backward(const HoloreelWarp* map, const float* image_gradient, float* source_gradient) {
+    return guarded([&] { warp_backward(*map, active_kernels().warp, image_gradient, source_gradient); }) ? 0 : -1;
 }

@@ -4,7 +4,7 @@
 
 #include <cstdint>
 
-#define HOLOREEL_ABI 7
+#define HOLOREEL_ABI 8
 #define HOLOREEL_API extern "C" __attribute__((visibility("default")))
 
 struct HoloreelCamera {
@@ -20,13 +20,16 @@ struct HoloreelRules {
 };
 
 // N rows in each array. With `spacetime` the parameters are raw (Eqs. 6-9); without it `scales` are linear, `opacities` lie
-// in [0, 1], and motions, omegas, trbf_centers, trbf_log_scales and time are ignored.
+// in [0, 1], and motions, omegas, trbf_centers, trbf_log_scales and time are ignored. `rows`, where not null, lists the
+// `listed` rows that are drawn, in ascending order, as if there were no others; there is no backward pass then.
 struct HoloreelGaussians {
     int64_t count;
     int32_t channels;
     int32_t spacetime;
     double time;
     const float *means, *motions, *quats, *omegas, *scales, *opacities, *features, *trbf_centers, *trbf_log_scales;
+    const uint32_t* rows;
+    int64_t listed;
 };
 
 // features (H, W, C), alpha (H, W), background (C) or null for black; depth and transmittance (H, W) or null. Transmittance
@@ -56,6 +59,17 @@ struct HoloreelDecoder {
     const float *hidden, *output;
     int32_t activation;
     int32_t unused;
+};
+
+// Where a lens's pixels (H, W) lie in a pinhole's picture, the source (H', W', C): `places` (H + 2, W + 2, 2) are x and y, in
+// its pixels, of the lens's pixel centers and of those one beyond the border. A pixel is the mean of `samples`² bicubic
+// samples at the middles of its parts, whose places are interpolated; 0 where not `valid` (H, W). What lies outside the
+// source is 0. `spans` (H, ceil(W / 64), 2) are the first and last source row that each block of 64 pixels looks at.
+struct HoloreelWarp {
+    const float* places;
+    const uint8_t* valid;
+    const int32_t* spans;
+    int32_t width, height, source_width, source_height, channels, samples;
 };
 
 // One tensor for Adam: rows of `columns` values. The step size is rate times the row's and the column's factor (null: 1);

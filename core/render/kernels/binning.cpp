@@ -103,7 +103,7 @@ void lay_out(const Splat& splat, const Ellipse& ellipse, const Frame& frame, Foo
     }
 }
 
-void write_record(const HoloreelGaussians& g, int64_t i, double log_opacity, const Splat& splat,
+void write_record(const HoloreelGaussians& g, int64_t row, double log_opacity, const Splat& splat,
                   const Ellipse& ellipse, const Frame& frame, float* target) {
     Record& record = *reinterpret_cast<Record*>(target);
     constexpr double scale = 0.84932180028801907;  // sqrt(log2(e) / 2): exp(-|w|²/2) = 2^-(|scale w|²)
@@ -115,7 +115,7 @@ void write_record(const HoloreelGaussians& g, int64_t i, double log_opacity, con
     record.log2_opacity = static_cast<float>(log_opacity * kLog2E);
     record.radii = bfloat_up(ellipse.radius_x()) | bfloat_up(ellipse.radius_y()) >> 16;
     float* channels = record.channels();
-    for (int c = 0; c < frame.channels; c++) channels[c] = g.features[i * frame.channels + c];
+    for (int c = 0; c < frame.channels; c++) channels[c] = g.features[row * frame.channels + c];
     for (int c = frame.channels; c < frame.padded_channels; c++) channels[c] = 0.0f;
     channels[frame.padded_channels] = static_cast<float>(splat.depth);
 }
@@ -136,16 +136,19 @@ HOLOREEL_HEAVY_CLONES void project_chunk(const HoloreelGaussians& g, const View&
     overflow.clear();
     const int64_t begin = chunk * kChunk, end = std::min(begin + kChunk, frame.count);
     visible = slots = 0;
-    uint32_t alive[kChunk];
+    if (g.rows && std::any_of(g.rows + begin, g.rows + end, [&](uint32_t row) { return row >= g.count; }))
+        throw std::out_of_range("a listed row is not there");
+    uint32_t places[kChunk], alive[kChunk];  // in the frame, and in the arrays
     int64_t count = 0;
     const bool cull = g.spacetime && rules.cull_faded;
     const double fade_limit = -log_alpha_min + 1e-6;
     for (int64_t first = begin; first < end; first += kRows) {
-        const RowSet rows(first, end);
+        const RowSet rows = g.rows ? RowSet(g.rows + first, end - first) : RowSet(first, end);
         const Mask seen = cull ? may_be_seen(g, rows, fade_limit) : ~Mask{};
         for (int lane = 0; lane < rows.count; lane++) {
             frame.footprints[first + lane].tiles = 0;
-            alive[count] = static_cast<uint32_t>(first + lane);
+            places[count] = static_cast<uint32_t>(first + lane);
+            alive[count] = static_cast<uint32_t>(rows.rows[lane]);
             count += seen[lane] & 1;
         }
     }
@@ -158,7 +161,7 @@ HOLOREEL_HEAVY_CLONES void project_chunk(const HoloreelGaussians& g, const View&
         seen &= project(instant, view, rules, splats);
         for (int lane = 0; lane < rows.count; lane++) {
             if (!seen[lane]) continue;
-            const int64_t i = rows.rows[lane];
+            const int64_t i = places[k + lane];
             Footprint& footprint = frame.footprints[i];
             const Splat splat = splat_at(splats, lane);
             const double log_opacity = std::log(instant.opacity[lane]);
@@ -167,7 +170,7 @@ HOLOREEL_HEAVY_CLONES void project_chunk(const HoloreelGaussians& g, const View&
             const Ellipse ellipse(splat, reach);
             lay_out(splat, ellipse, frame, footprint, overflow);
             if (footprint.tiles == 0) continue;
-            write_record(g, i, log_opacity, splat, ellipse, frame, frame.records.data() + i * stride);
+            write_record(g, rows.rows[lane], log_opacity, splat, ellipse, frame, frame.records.data() + i * stride);
             keys[begin + visible++] = depth_key(splat.depth, i);
             slots += footprint.tiles;
         }

@@ -24,6 +24,7 @@ struct Footprint {
     uint32_t columns[kInline];  // begin | end << 16
 };
 
+// Where rows are listed, a Gaussian's index here is its place in the list.
 struct Frame {
     int64_t count = 0;
     int width = 0, height = 0, channels = 0, padded_channels = 0, tiles_x = 0, tiles_y = 0;

@@ -75,11 +75,31 @@ struct DecodeKernels {
     void (*backward)(const DecodeJob&, int row, DecodeSums&);
 };
 
+// A block is as many pixels of a row; the places of a lens's pixels in a pinhole's picture, the source.
+constexpr int kWarpBlock = 64, kMaxWarpSamples = 4;
+constexpr int warp_blocks(int width) { return (width + kWarpBlock - 1) / kWarpBlock; }
+
+struct WarpJob {
+    const float* places;   // (H + 2, W + 2, 2)
+    const uint8_t* valid;  // (H, W)
+    const int32_t* spans;  // (H, blocks, 2), for the backward pass
+    int width, height, source_width, source_height, channels, samples;
+    const float *source, *image_gradient;
+    float *image, *source_gradient;
+};
+
+struct WarpKernels {
+    void (*spans)(const WarpJob&, int row, int32_t* spans);
+    void (*forward)(const WarpJob&, int row);
+    void (*backward)(const WarpJob&, int first, int rows, float* sums);  // room for whole vectors per source pixel
+};
+
 struct RasterKernels {
     int lanes;
     TileKernel (*forward)(int padded_channels, bool with_depth);
     TileKernel (*backward)(int padded_channels, bool with_depth);
     DecodeKernels decode;
+    WarpKernels warp;
 };
 
 // The channel counts the kernels are compiled for; others are padded up.

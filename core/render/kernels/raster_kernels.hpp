@@ -5,6 +5,7 @@
 #include "decode_row.hpp"
 #include "raster_backward.hpp"
 #include "raster_forward.hpp"
+#include "warp_row.hpp"
 
 namespace holoreel {
 namespace HOLOREEL_NAMESPACE {
@@ -24,7 +25,8 @@ static TileKernel choose_backward(int padded_channels, bool with_depth) { HOLORE
 
 #undef HOLOREEL_EACH_WIDTH
 
-static const RasterKernels kernels = {kLanes, choose_forward, choose_backward, {decode_row, decode_row_backward}};
+static const RasterKernels kernels = {
+    kLanes, choose_forward, choose_backward, {decode_row, decode_row_backward}, {warp_spans, warp_forward, warp_backward}};
 
 }  // namespace HOLOREEL_NAMESPACE
 }  // namespace holoreel
