@@ -18,6 +18,7 @@ from .gaussians.model import SpacetimeGaussians
 from .reel import Loaded, Triple, load_gaussians
 from .render import Backend, get_backend
 from .render.contract import Rules, SpacetimeTensors
+from .render.lifetimes import Lifetimes
 from .render.view import DecoderTensors, decoder_tensors, render_view
 
 SEGMENTS_HELD = 2  # in memory at a time: going back and forth over a seam reads nothing twice
@@ -42,14 +43,15 @@ def draw(
     background: Triple = (0.0, 0.0, 0.0),
     decoder: DecoderTensors | None = None,
     rules: Rules | None = None,
+    rows: torch.Tensor | None = None,
 ) -> Drawing:
     """Draw Gaussians at a normalized time through any lens; `backend` as `core.render.get_backend` returns it.
 
-    With a `decoder`, `background` is ignored: it colors every pixel.
+    With a `decoder`, `background` is ignored: it colors every pixel. `rows` are those that are drawn, all if None.
     """
     with torch.no_grad():
         color = torch.tensor(background, device=backend.DEVICE)
-        rendering = render_view(backend, gaussians, time, camera, color, decoder, rules)
+        rendering = render_view(backend, gaussians, time, camera, color, decoder, rules, rows=rows)
     return Drawing(*(part.cpu().numpy() for part in rendering))
 
 
@@ -76,6 +78,7 @@ class Player:
         self.report = self.first.report
         whole = self.first.reel or self.first
         self.frame_start, self.frame_count = whole.frame_start, whole.frame_count
+        self.rules = Rules(near=self.first.reel.near) if self.first.reel else Rules()
         self._segment = lru_cache(maxsize=SEGMENTS_HELD)(self._load)
 
     def frame_at(self, time: float) -> float:
@@ -100,18 +103,31 @@ class Player:
         return [float(frame) for frame in range(start, end + 1)]
 
     def draw(
-        self, camera: Camera, frame: float, background: Triple | None = None, rules: Rules | None = None
+        self,
+        camera: Camera,
+        frame: float,
+        background: Triple | None = None,
+        rules: Rules | None = None,
+        listed: bool = True,
     ) -> Drawing:
-        """Draw one frame, over the reel's own background unless another is given; a full model has none."""
+        """Draw one frame, over the reel's own background unless another is given; a full model has none.
+
+        `listed` draws only the rows that are alive at the frame: the same picture, sooner.
+        """
         reel = self.first.reel
         segment, time = reel.locate(frame) if reel else (0, self.first.time_of(frame))
-        gaussians, decoder = self._segment(segment)
+        gaussians, decoder, lifetimes = self._segment(segment)
         color = self.first.background if background is None else background
-        rules = rules or (Rules(near=reel.near) if reel else None)
-        return draw(gaussians, time, camera, self.backend, color, decoder, rules)
+        rules = rules or self.rules
+        # The lists hold for the usual threshold of visibility.
+        known = listed and rules.alpha_min == lifetimes.alpha_min
+        rows = lifetimes.rows(time) if known else None
+        return draw(gaussians, time, camera, self.backend, color, decoder, rules, rows)
 
-    def _load(self, segment: int) -> tuple[SpacetimeTensors, DecoderTensors | None]:
+    def _load(self, segment: int) -> tuple[SpacetimeTensors, DecoderTensors | None, Lifetimes]:
         loaded = self.first if segment == 0 else load_gaussians(self.path, segment)
         decoder = decoder_tensors(loaded.decoder) if loaded.decoder else None
         tensors = to_tensors(loaded.gaussians, decoded=decoder is not None)
-        return SpacetimeTensors(*(tensor.to(self.backend.DEVICE) for tensor in tensors)), decoder
+        frames = loaded.reel.segments[segment].frame_count if loaded.reel else loaded.frame_count
+        lifetimes = Lifetimes(tensors, frames, Rules().alpha_min)
+        return SpacetimeTensors(*(tensor.to(self.backend.DEVICE) for tensor in tensors)), decoder, lifetimes

@@ -119,7 +119,8 @@ def render(
     """Print how many frames of a reel are drawn in a second, with and without temporal culling.
 
     Args:
-        what: All frames of a reel, PLY or .splatv, from one camera.
+        what: All frames of a reel, PLY or .splatv, from one camera, in three ways with the same pictures: `listed`,
+            what is alive is known beforehand, as when a reel is played; `culled`, the kernels find out; `not culled`.
         reel: The file.
         view: A CAMERA.json, or a capture: its first camera that is held out.
         size: Pictures as WIDTHxHEIGHT instead of the camera's own.

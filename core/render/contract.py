@@ -13,7 +13,7 @@ are differentiable with respect to every tensor argument.
     rasterize_spacetime(gaussians: SpacetimeTensors, time, camera, background=None, rules=None, density=None, rows=None)
         -> Rendering
         Spacetime Gaussians at `time` (Eqs. 6-9), evaluated and projected in one pass. `rows`, an ascending int32 (M,),
-        draws those alone (`core.render.lifetimes` lists the ones that are alive), for a cost that the others have no
+        draws those alone (`lifetimes` lists those alive), for a cost that the others have no
         part in; `density` cannot be had with it.
     decode(features, camera, hidden, output, activation) -> Tensor
         The colors (H,W,3) of a full model's rendering (Eqs. 10-11): features (H,W,9) are [base, direction, time],
@@ -92,6 +92,11 @@ class SpacetimeTensors(NamedTuple):
     features: Tensor
     trbf_centers: Tensor
     trbf_log_scales: Tensor
+
+
+def listed(g: SpacetimeTensors, rows: Tensor | None) -> SpacetimeTensors:
+    """Return the Gaussians of the listed rows alone, all if there is no list."""
+    return g if rows is None else SpacetimeTensors(*(array[rows.to(array.device)] for array in g))
 
 
 class Rendering(NamedTuple):

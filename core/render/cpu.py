@@ -15,9 +15,8 @@ from torch.autograd.function import once_differentiable
 
 from ..camera import Camera
 from ..errors import HoloreelError
-from . import reference
 from .checks import check_adam, check_decoder, check_gaussians, check_images, check_pinhole, check_spacetime
-from .contract import ACTIVATIONS, AdamGroup, DensityStats, PictureLoss, Rendering, Rules, SpacetimeTensors
+from .contract import ACTIVATIONS, AdamGroup, DensityStats, PictureLoss, Rendering, Rules, SpacetimeTensors, listed
 from .native import (
     PARAMETERS,
     TIMINGS,
@@ -91,10 +90,9 @@ def rasterize_spacetime(
     check_spacetime(gaussians, background, density, rows)
     if rows is not None:
         rows = rows.to("cpu").contiguous()
-        if torch.is_grad_enabled() and any(
-            array.requires_grad for array in (*gaussians, background) if array is not None
-        ):
-            gaussians, rows = reference.listed(gaussians, rows), None  # the kernels read a list forward only
+        learning = torch.is_grad_enabled() and any(array.requires_grad for array in gaussians)
+        if learning or len(rows) == 0:  # the kernels have no backward pass for a list, and an empty one has no address
+            gaussians, rows = listed(gaussians, rows), None
     return _render(_Job(camera, rules, float(time), density, rows), background, tuple(gaussians))
 
 

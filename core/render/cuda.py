@@ -20,7 +20,7 @@ from ..camera import Camera
 from ..errors import HoloreelError
 from . import cpu, reference
 from .checks import check_decoder, check_gaussians, check_pinhole, check_spacetime
-from .contract import AdamGroup, DensityStats, PictureLoss, Rendering, Rules, SpacetimeTensors
+from .contract import AdamGroup, DensityStats, PictureLoss, Rendering, Rules, SpacetimeTensors, listed
 from .reference import Gaussians3D
 from .warp import Warp
 
@@ -75,7 +75,7 @@ def rasterize_spacetime(
     rules = rules or Rules()
     check_pinhole(camera)
     check_spacetime(gaussians, background, density, rows)
-    everything = reference.listed(SpacetimeTensors(*map(_there, gaussians)), rows)
+    everything = listed(SpacetimeTensors(*map(_there, gaussians)), rows)
     living = reference.alive(everything, time, rules)
     chosen = SpacetimeTensors(*(array[living] for array in everything))
     return _render(reference.evaluate(chosen, time, rules), living, camera, background, rules, density)

@@ -15,7 +15,7 @@ from torch.utils.checkpoint import checkpoint
 
 from ..camera import Camera
 from .checks import check_adam, check_decoder, check_gaussians, check_images, check_pinhole, check_spacetime
-from .contract import AdamGroup, DensityStats, PictureLoss, Rendering, Rules, SpacetimeTensors
+from .contract import AdamGroup, DensityStats, PictureLoss, Rendering, Rules, SpacetimeTensors, listed
 from .warp import Warp
 
 DEVICE = "cpu"  # where nothing says otherwise; it works wherever its arguments lie
@@ -95,11 +95,6 @@ def rasterize_spacetime(
         return evaluate(SpacetimeTensors(*(array[chosen] for array in gaussians)), time, rules)
 
     return _render(at_time, living, camera, background, rules, density)
-
-
-def listed(g: SpacetimeTensors, rows: Tensor | None) -> SpacetimeTensors:
-    """Return the Gaussians of the listed rows alone, all if there is no list."""
-    return g if rows is None else SpacetimeTensors(*(array[rows.to(array.device)] for array in g))
 
 
 def alive(g: SpacetimeTensors, time: float, rules: Rules) -> Tensor:

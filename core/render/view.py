@@ -9,7 +9,7 @@ from torch import Tensor
 
 from ..camera import Camera
 from ..gaussians.decoder import Decoder
-from .contract import DensityStats, Rendering, Rules, SpacetimeTensors
+from .contract import DensityStats, Rendering, Rules, SpacetimeTensors, listed
 
 
 class DecoderTensors(NamedTuple):
@@ -34,24 +34,28 @@ def render_view(
     decoder: DecoderTensors | None = None,
     rules: Rules | None = None,
     density: DensityStats | None = None,
+    rows: Tensor | None = None,
 ) -> Rendering:
     """Draw Gaussians at a normalized time through any lens; `backend` as `core.render.get_backend` returns it.
 
     `gaussians.features` have 3 columns, or 9 with a `decoder`; the rendering's `features` are colors (H, W, 3) either
     way, with what `contract` says of `alpha` and `depth`. `background` (3,) lies behind a lite model, black if None; a
     full model is drawn over zeros, because its decoder colors every pixel, and `background` is ignored. A lens with
-    distortion is drawn by a virtual pinhole and warped (`warp`). Differentiable like the backends.
+    distortion is drawn by a virtual pinhole and warped (`warp`). `rows` are the only ones drawn (`lifetimes`), without
+    `density`. Differentiable like the backends.
     """
+    if rows is not None and decoder is not None:  # the time feature of the others would cost more than is saved
+        gaussians, rows = listed(gaussians, rows), None
     if decoder is not None:
         gaussians, background = _with_time(gaussians, time, rules), None
     if camera.model == "PINHOLE":
-        rendering = backend.rasterize_spacetime(gaussians, time, camera, background, rules, density)
+        rendering = backend.rasterize_spacetime(gaussians, time, camera, background, rules, density, rows)
         return rendering if decoder is None else _decoded(backend, rendering, camera, decoder)
 
     from .warp import lens_warp
 
     warp = lens_warp(camera)
-    rendering = backend.rasterize_spacetime(gaussians, time, warp.pinhole, None, rules, density)
+    rendering = backend.rasterize_spacetime(gaussians, time, warp.pinhole, None, rules, density, rows)
     if decoder is not None:
         rendering = _decoded(backend, rendering, warp.pinhole, decoder)
     color, alpha, depth = rendering

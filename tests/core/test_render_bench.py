@@ -64,6 +64,7 @@ def test_frames_per_second_of_a_reel(recording, view, tmp_path, capsys):
     figures = json.loads(out.read_text())
     assert (figures["width"], figures["height"], figures["frames"]) == (64, 48, 3)
     assert all(speed["fps"] > 0 and speed["authors_fps"] > 0 for speed in figures["speeds"].values())
+    assert tuple(figures["speeds"]) == tuple(render.METHODS)
     assert "temporal culling is" in capsys.readouterr().out
     assert main([*command, "--size", "64"]) == 2
     assert "--size 64" in capsys.readouterr().err

@@ -14,7 +14,7 @@ constexpr int kMaxTaps = kWarpBlock * kMaxWarpSamples * kMaxWarpSamples;
 // Of each sample of a block: the first of its 4 x 4 pixels, and the weights of its columns and rows.
 struct Taps {
     int32_t x[kMaxTaps], y[kMaxTaps];
-    float wx[kMaxTaps][4], wy[kMaxTaps][4];
+    float wx[4][kMaxTaps], wy[4][kMaxTaps];
 };
 
 HOLOREEL_INLINE int32_t floor_of(float t) {
@@ -23,31 +23,32 @@ HOLOREEL_INLINE int32_t floor_of(float t) {
 }
 
 // Keys' kernel with a = -3/4, as torch has it, at a position `t` in [0, 1) between the second and the third tap.
-HOLOREEL_INLINE void cubic_weights(float t, float* out) {
+HOLOREEL_INLINE void cubic_weights(float t, float (*out)[kMaxTaps], int k) {
     constexpr float a = -0.75f;
     const float s = 1.0f - t;
-    out[0] = a * t * s * s;
-    out[1] = ((a + 2.0f) * t - (a + 3.0f)) * t * t + 1.0f;
-    out[2] = ((a + 2.0f) * s - (a + 3.0f)) * s * s + 1.0f;
-    out[3] = a * s * t * t;
+    out[0][k] = a * t * s * s;
+    out[1][k] = ((a + 2.0f) * t - (a + 3.0f)) * t * t + 1.0f;
+    out[2][k] = ((a + 2.0f) * s - (a + 3.0f)) * s * s + 1.0f;
+    out[3][k] = a * s * t * t;
 }
 
 // One coordinate of a sample, interpolated between the pixels' own. Distances to a whole number near by are taken first:
 // those are small and exact, where positions of a large picture would lose digits.
-HOLOREEL_INLINE void find_tap(float middle, float aside, float above, float across, float dx, float dy, int32_t& first,
-                              float* weights) {
+HOLOREEL_INLINE void find_tap(float middle, float aside, float above, float across, float dx, float dy, int32_t* first,
+                              float (*weights)[kMaxTaps], int k) {
     const int32_t whole = floor_of(middle);
     const float base = static_cast<float>(whole);
     const float near = (middle - base) * (1.0f - dx) + (aside - base) * dx;
     const float far = (above - base) * (1.0f - dx) + (across - base) * dx;
     const float t = near * (1.0f - dy) + far * dy - 0.5f;
     const int32_t n = floor_of(t);
-    first = whole + n - 1;
-    cubic_weights(t - static_cast<float>(n), weights);
+    first[k] = whole + n - 1;
+    cubic_weights(t - static_cast<float>(n), weights, k);
 }
 
-// The taps of `count` pixels of a row, from `begin` on: those of sample s of pixel p at [p * samples² + s].
-static void find_taps(const WarpJob& job, int row, int begin, int count, Taps& taps) {
+// The taps of `count` pixels of a row, from `begin` on: those of sample s of pixel p at
+// [s * kWarpBlock + p]. The compiler turns the inner loop into vectors.
+static void find_taps(const WarpJob& job, int row, int begin, int count, Taps& __restrict taps) {
     const int n = job.samples;
     const int64_t pitch = 2 * (static_cast<int64_t>(job.width) + 2);
     const float* places = job.places + (row + 1) * pitch + 2 * (begin + 1);
@@ -58,9 +59,9 @@ static void find_taps(const WarpJob& job, int row, int begin, int count, Taps& t
             const float dy = down < 0 ? -down : down, dx = right < 0 ? -right : right;
             for (int p = 0; p < count; p++) {
                 const float* m = places + 2 * p;
-                const int k = p * n * n + i * n + j;
-                find_tap(m[0], m[to_column], m[to_row], m[to_row + to_column], dx, dy, taps.x[k], taps.wx[k]);
-                find_tap(m[1], m[to_column + 1], m[to_row + 1], m[to_row + to_column + 1], dx, dy, taps.y[k], taps.wy[k]);
+                const int k = (i * n + j) * kWarpBlock + p;
+                find_tap(m[0], m[to_column], m[to_row], m[to_row + to_column], dx, dy, taps.x, taps.wx, k);
+                find_tap(m[1], m[to_column + 1], m[to_row + 1], m[to_row + to_column + 1], dx, dy, taps.y, taps.wy, k);
             }
         }
     }
@@ -84,10 +85,13 @@ static void warp_spans(const WarpJob& job, int row, int32_t* spans) {
         const int begin = block * kWarpBlock, count = block_pixels(job, begin);
         int32_t first = INT32_MAX, last = INT32_MIN;
         find_taps(job, row, begin, count, taps);
-        for (int k = 0; k < count * n; k++) {
-            if (!valid[begin + k / n]) continue;
-            first = taps.y[k] < first ? taps.y[k] : first;
-            last = taps.y[k] + 3 > last ? taps.y[k] + 3 : last;
+        for (int p = 0; p < count; p++) {
+            if (!valid[begin + p]) continue;
+            for (int s = 0; s < n; s++) {
+                const int32_t y = taps.y[s * kWarpBlock + p];
+                first = y < first ? y : first;
+                last = y + 3 > last ? y + 3 : last;
+            }
         }
         int32_t* span = spans + 2 * (static_cast<int64_t>(row) * blocks + block);
         span[0] = first;
@@ -99,16 +103,15 @@ static void warp_spans(const WarpJob& job, int row, int32_t* spans) {
 template <int V>
 HOLOREEL_INLINE void add_sample(const WarpJob& job, const Taps& taps, int k, F* sum) {
     const int x = taps.x[k], y = taps.y[k], channels = job.channels;
-    const float *wx = taps.wx[k], *wy = taps.wy[k];
     const int64_t pitch = static_cast<int64_t>(job.source_width) * channels;
     const int64_t at = y * pitch + static_cast<int64_t>(x) * channels;
     // Whole vectors are read, also behind a pixel; not behind the picture.
     if (x >= 0 && y >= 0 && x + 3 < job.source_width && y + 3 < job.source_height &&
         at + 3 * pitch + 3 * channels + V * kLanes <= job.source_height * pitch) {
-        const F w0 = set1(wx[0]), w1 = set1(wx[1]), w2 = set1(wx[2]), w3 = set1(wx[3]);
+        const F w0 = set1(taps.wx[0][k]), w1 = set1(taps.wx[1][k]), w2 = set1(taps.wx[2][k]), w3 = set1(taps.wx[3][k]);
         for (int r = 0; r < 4; r++) {
             const float* line = job.source + at + r * pitch;
-            const F weight = set1(wy[r]);
+            const F weight = set1(taps.wy[r][k]);
             for (int v = 0; v < V; v++) {
                 F value = mul(load(line + v * kLanes), w0);
                 value = fma(load(line + channels + v * kLanes), w1, value);
@@ -126,7 +129,7 @@ HOLOREEL_INLINE void add_sample(const WarpJob& job, const Taps& taps, int k, F* 
         for (int c = 0; c < 4; c++) {
             if (x + c < 0 || x + c >= job.source_width) continue;
             const float* pixel = job.source + at + r * pitch + static_cast<int64_t>(c) * channels;
-            for (int k = 0; k < channels; k++) values[k] += wy[r] * wx[c] * pixel[k];
+            for (int i = 0; i < channels; i++) values[i] += taps.wy[r][k] * taps.wx[c][k] * pixel[i];
         }
     }
     for (int v = 0; v < V; v++) sum[v] = load(values + v * kLanes);
@@ -147,7 +150,7 @@ static void warp_row(const WarpJob& job, int row) {
             F sum[V];
             for (int v = 0; v < V; v++) sum[v] = set1(0.0f);
             if (valid[p])
-                for (int s = 0; s < n; s++) add_sample<V>(job, taps, p * n + s, sum);
+                for (int s = 0; s < n; s++) add_sample<V>(job, taps, s * kWarpBlock + p, sum);
             float values[V * kLanes];
             for (int v = 0; v < V; v++) store(values + v * kLanes, mul(sum[v], share));
             for (int c = 0; c < channels; c++) image[c] = values[c];
@@ -162,16 +165,16 @@ HOLOREEL_INLINE void spread_sample(const WarpJob& job, const Taps& taps, int k, 
     const int x = taps.x[k], y = taps.y[k];
     const int row_begin = y < first ? first - y : 0, row_end = first + rows - y < 4 ? first + rows - y : 4;
     const bool inside = x >= 0 && x + 3 < job.source_width;
-    const float* wx = taps.wx[k];
+    const F weights[4] = {set1(taps.wx[0][k]), set1(taps.wx[1][k]), set1(taps.wx[2][k]), set1(taps.wx[3][k])};
     for (int r = row_begin; r < row_end; r++) {
         float* line = sums + (static_cast<int64_t>(y + r - first) * job.source_width + x) * (V * kLanes);
         F part[V];
-        for (int v = 0; v < V; v++) part[v] = mul(gradient[v], set1(taps.wy[k][r]));
+        for (int v = 0; v < V; v++) part[v] = mul(gradient[v], set1(taps.wy[r][k]));
         for (int c = 0; c < 4; c++) {
             if (!inside && (x + c < 0 || x + c >= job.source_width)) continue;
             for (int v = 0; v < V; v++) {
                 float* place = line + (c * V + v) * kLanes;
-                store(place, fma(part[v], set1(wx[c]), load(place)));
+                store(place, fma(part[v], weights[c], load(place)));
             }
         }
     }
@@ -196,7 +199,7 @@ static void warp_band(const WarpJob& job, int first, int rows, float* sums) {
                 for (int c = 0; c < channels; c++) values[c] = job.image_gradient[(pixel + p) * channels + c];
                 F gradient[V];
                 for (int v = 0; v < V; v++) gradient[v] = mul(load(values + v * kLanes), set1(1.0f / n));
-                for (int s = 0; s < n; s++) spread_sample<V>(job, taps, p * n + s, gradient, first, rows, sums);
+                for (int s = 0; s < n; s++) spread_sample<V>(job, taps, s * kWarpBlock + p, gradient, first, rows, sums);
             }
         }
     }
