@@ -119,8 +119,8 @@ class Player:
         gaussians, decoder, lifetimes = self._segment(segment)
         color = self.first.background if background is None else background
         rules = rules or self.rules
-        # The lists hold for the usual threshold of visibility.
-        known = listed and rules.alpha_min == lifetimes.alpha_min
+        # The lists hold for the usual threshold of visibility, and where what has faded shall be left out.
+        known = listed and rules.cull_faded and rules.alpha_min == lifetimes.alpha_min
         rows = lifetimes.rows(time) if known else None
         return draw(gaussians, time, camera, self.backend, color, decoder, rules, rows)
 

@@ -23,8 +23,8 @@ PASSES, DROPPED = 4, 11  # the authors': passes over all frames, and how many at
 class Method(NamedTuple):
     """A way of drawing."""
 
-    listed: bool  # what is alive is known beforehand, as the player has it
-    cull_faded: bool  # else the kernels find out, or draw what has faded out too
+    listed: bool  # what is alive is known beforehand, as the player has it; else the kernels find out
+    cull_faded: bool  # else what has faded out is drawn too
 
 
 LISTED, NOT_CULLED = "listed", "not culled"

@@ -83,8 +83,7 @@ def check_adam(groups: Sequence[AdamGroup], step: int) -> None:
 
 
 def check_decoder(features: Tensor, camera: Camera, hidden: Tensor, output: Tensor, activation: str) -> None:
-    """Raise ValueError unless the arguments of `decode` are as the contract says."""
-    check_pinhole(camera)
+    """Raise ValueError unless the arguments of `decode` are as the contract says, whatever the lens."""
     _check_shapes(
         features=(features, (camera.height, camera.width, 9)), hidden=(hidden, (6, 12)), output=(output, (3, 6))
     )

@@ -21,8 +21,11 @@ are differentiable with respect to every tensor argument.
         activation(base + output · relu(hidden · [direction, time, ray origin, ray direction])), with the ray through
         the pixel's center in the world and its direction of unit length. `clamp` passes no gradient outside [0, 1].
 
-    warp(image, lens: core.render.warp.Warp) -> Tensor
-        What a lens with distortion sees (H,W,C) of the picture (H',W',C) that its virtual pinhole sees.
+    native_lens(camera) -> bool
+        Whether `rasterize`, `rasterize_spacetime` and `decode` take this camera as it is: PINHOLE always.
+    warp(rendering, lens: core.render.warp.Warp, background=None) -> Rendering
+        What a lens with distortion sees of the rendering that its virtual pinhole makes over black, with `background`
+        behind it then.
 
 What training needs beside them:
 
@@ -36,8 +39,8 @@ What training needs beside them:
         One step of Adam for every tensor of a model in one pass, in place, as `torch.optim.Adam` does; `step` counts
         from 1.
 
-`camera` is a `holoreel.core.camera.Camera` (PINHOLE); `background` a (C,) tensor or None for black; `rules` None for
-`Rules()`. C is 1 to 16.
+`camera` is a `holoreel.core.camera.Camera` for which `native_lens` holds; `background` a (C,) tensor or None for black;
+`rules` None for `Rules()`. C is 1 to 16.
 
 Gaussians are drawn in the order of their camera-space z, rounded to single precision; equal ones in the order of their
 rows. A row is skipped, and gets zero gradient, where a parameter is not finite (but an infinite `trbf_log_scale` means
@@ -67,7 +70,8 @@ class Rules:
     are held within the picture and a margin on each of its four sides, wherever the principal point lies: the margin is
     (jacobian_clamp - 1) / 2 of the width or height. `detach_motion_time` makes `trbf_centers` learn from the opacity
     alone, as the authors train: by default it also gets the gradient through motion and rotation. Without `cull_faded`
-    the kernels project and tile what the time has faded out too, as the authors do: the same picture, later.
+    the kernels project and tile what the time has faded out too, as the authors do: the same picture, later. With
+    `warp_lenses`, `view` warps lenses with distortion even where the backend could draw them as they are.
     """
 
     alpha_max: float = 0.99
@@ -78,6 +82,7 @@ class Rules:
     jacobian_clamp: float = 1.3
     detach_motion_time: bool = False
     cull_faded: bool = True
+    warp_lenses: bool = False
 
 
 class SpacetimeTensors(NamedTuple):

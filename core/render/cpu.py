@@ -46,6 +46,7 @@ __all__ = [
     "get_threads",
     "l1_dssim",
     "load_kernels",
+    "native_lens",
     "picture_loss",
     "rasterize",
     "rasterize_spacetime",
@@ -249,6 +250,7 @@ class _Rasterize(torch.autograd.Function):
 
 def decode(features: Tensor, camera: Camera, hidden: Tensor, output: Tensor, activation: str) -> Tensor:
     """Turn the features of a full model's rendering into colors; shapes and meanings as in `contract`. float32."""
+    check_pinhole(camera)
     check_decoder(features, camera, hidden, output, activation)
     return _Decode.apply(_plain(features), camera, _plain(hidden), _plain(output), ACTIVATIONS.index(activation))
 
@@ -283,31 +285,91 @@ class _Decode(torch.autograd.Function):
         return d_features, None, d_hidden, d_output, None
 
 
-def warp(image: Tensor, lens: Warp) -> Tensor:
-    """Return what a lens sees of its pinhole's picture; as in `contract`. float32; 1 to 16 channels."""
-    lens.check(image)
-    return _WarpPicture.apply(_plain(image), lens)
+def native_lens(camera: Camera) -> bool:
+    """Return whether the lens can be drawn as it is: pinholes alone."""
+    return camera.model == "PINHOLE"
 
 
-class _WarpPicture(torch.autograd.Function):
+def warp(rendering: Rendering, lens: Warp, background: Tensor | None = None) -> Rendering:
+    """Return what a lens sees of its pinhole's rendering; as in `contract`. float32; up to 14 channels."""
+    lens.check(rendering.features)
+    return Rendering(*_See.apply(lens, _plain(background), *map(_plain, rendering)))
+
+
+class _See(torch.autograd.Function):
+    """Colors, alpha and alpha · depth are warped in one pass; backward, only what has a gradient."""
+
     @staticmethod
-    def forward(ctx: Any, image: Tensor, lens: Warp) -> Tensor:
-        picture = _memory.empty(*lens.valid.shape, image.shape[2])
-        library = load_kernels()
-        if library.holoreel_warp(_c_warp(lens, image.shape[2]), _address(image), _address(picture)) != 0:
-            raise HoloreelError(f"The picture cannot be warped: {library.holoreel_last_error().decode()}.")
-        ctx.lens, ctx.shape = lens, image.shape
-        return picture
+    def forward(
+        ctx: Any, lens: Warp, background: Tensor | None, color: Tensor, alpha: Tensor, depth: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        channels = color.shape[2]
+        layers = _memory.empty(*alpha.shape, channels + 2)
+        layers[..., :channels], layers[..., channels] = color, alpha
+        torch.mul(alpha, depth, out=layers[..., channels + 1])
+        seen = warp_layers(layers, lens)
+        raw = seen[..., channels]
+        seen_alpha = raw.clamp(0.0, 1.0)
+        inverse = seen_alpha.reciprocal().masked_fill_(seen_alpha == 0.0, 0.0)
+        seen_depth = seen[..., channels + 1] * inverse
+        seen_color = seen[..., :channels].contiguous()
+        if background is not None and not ctx.needs_input_grad[1] and not background.any():
+            background = None
+        if background is not None:
+            seen_color.addcmul_((1.0 - seen_alpha)[..., None], background)
+        ctx.lens = lens
+        ctx.set_materialize_grads(False)
+        ctx.save_for_backward(background, alpha, depth, seen_alpha, seen_depth, inverse, raw == seen_alpha)
+        return seen_color, seen_alpha, seen_depth
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None]:
-        incoming, outgoing = _plain(gradient), _memory.empty(*ctx.shape)
-        library = load_kernels()
-        described = _c_warp(ctx.lens, ctx.shape[2], _spans(ctx.lens))
-        if library.holoreel_warp_backward(described, _address(incoming), _address(outgoing)) != 0:
-            raise HoloreelError(f"The gradient cannot be computed: {library.holoreel_last_error().decode()}.")
-        return outgoing, None
+    def backward(
+        ctx: Any, d_color: Tensor | None, d_alpha: Tensor | None, d_depth: Tensor | None
+    ) -> tuple[Tensor | None, ...]:
+        background, alpha, depth, seen_alpha, seen_depth, inverse, unclamped = ctx.saved_tensors
+        d_background = None
+        if background is not None and d_color is not None:
+            behind = -(d_color @ background)
+            d_alpha = behind if d_alpha is None else d_alpha + behind
+            if ctx.needs_input_grad[1]:
+                d_background = torch.einsum("hwc,hw->c", d_color.double(), 1.0 - seen_alpha.double()).float()
+        d_weighted = None
+        if d_depth is not None:
+            d_weighted = d_depth * inverse
+            d_alpha = -d_weighted * seen_depth if d_alpha is None else d_alpha - d_weighted * seen_depth
+        if d_alpha is not None:
+            d_alpha = (d_alpha * unclamped)[..., None]
+        parts = (d_color, d_alpha, None if d_weighted is None else d_weighted[..., None])
+        given = [part for part in parts if part is not None]
+        if not given:
+            return (None,) * 5
+        found = iter(spread_layers(torch.cat(given, dim=2), ctx.lens).split([part.shape[2] for part in given], dim=2))
+        d_color, d_alpha, d_weighted = (None if part is None else next(found) for part in parts)
+        d_alpha = None if d_alpha is None else d_alpha[..., 0]
+        if d_weighted is not None:
+            d_alpha, d_depth = d_alpha + d_weighted[..., 0] * depth, d_weighted[..., 0] * alpha
+        return None, d_background, d_color, d_alpha, d_depth
+
+
+def warp_layers(layers: Tensor, lens: Warp) -> Tensor:
+    """Return what `lens.apply` does of a float32 picture (H', W', C) on the CPU, C 1 to 16."""
+    picture = _memory.empty(*lens.valid.shape, layers.shape[2])
+    library = load_kernels()
+    if library.holoreel_warp(_c_warp(lens, layers.shape[2]), _address(layers), _address(picture)) != 0:
+        raise HoloreelError(f"The picture cannot be warped: {library.holoreel_last_error().decode()}.")
+    return picture
+
+
+def spread_layers(gradient: Tensor, lens: Warp) -> Tensor:
+    """Return the gradient of the layers from that of what was warped, (H, W, C)."""
+    incoming = _plain(gradient)
+    outgoing = _memory.empty(lens.pinhole.height, lens.pinhole.width, gradient.shape[2])
+    library = load_kernels()
+    described = _c_warp(lens, gradient.shape[2], _spans(lens))
+    if library.holoreel_warp_backward(described, _address(incoming), _address(outgoing)) != 0:
+        raise HoloreelError(f"The gradient cannot be computed: {library.holoreel_last_error().decode()}.")
+    return outgoing
 
 
 WARP_BLOCK = 64  # kWarpBlock in kernels/raster.hpp

@@ -7,8 +7,10 @@ tiles are taken in groups of about equal length, padded, and composited by a cum
 
 import math
 from collections.abc import Callable, Iterator, Sequence
+from functools import lru_cache
 from typing import NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor
 from torch.utils.checkpoint import checkpoint
@@ -16,7 +18,7 @@ from torch.utils.checkpoint import checkpoint
 from ..camera import Camera
 from .checks import check_adam, check_decoder, check_gaussians, check_images, check_pinhole, check_spacetime
 from .contract import AdamGroup, DensityStats, PictureLoss, Rendering, Rules, SpacetimeTensors, listed
-from .warp import Warp
+from .warp import Lens, Warp, camera_of, lens_of
 
 DEVICE = "cpu"  # where nothing says otherwise; it works wherever its arguments lie
 TILE = 16
@@ -315,19 +317,28 @@ def _watch_density(splats: Splats, camera: Camera, rules: Rules, density: Densit
 
 
 def decode(features: Tensor, camera: Camera, hidden: Tensor, output: Tensor, activation: str) -> Tensor:
-    """Turn the features of a full model's rendering into colors; shapes and meanings as in `contract`."""
+    """Turn the features of a full model's rendering into colors; shapes and meanings as in `contract`.
+
+    Takes any lens; a pixel where it sees nothing is black.
+    """
     check_decoder(features, camera, hidden, output, activation)
     origin = torch.tensor(camera.center.tolist(), dtype=features.dtype, device=features.device)
-    units = features[..., 3:] @ hidden[:, :6].T + directions(camera, features) @ hidden[:, 9:].T
+    rays = directions(camera, features)
+    units = features[..., 3:] @ hidden[:, :6].T + rays @ hidden[:, 9:].T
     colors = features[..., :3] + torch.relu(units + hidden[:, 6:9] @ origin) @ output.T
-    if activation == "sigmoid":
-        return torch.sigmoid(colors)
-    return colors.clamp(0, 1) if activation == "clamp" else colors
+    if activation != "none":
+        colors = torch.sigmoid(colors) if activation == "sigmoid" else colors.clamp(0, 1)
+    return colors if camera.model == "PINHOLE" else colors * rays.any(dim=2, keepdim=True)
 
 
 def directions(camera: Camera, like: Tensor) -> Tensor:
-    """Return (H, W, 3) unit directions in the world through all pixel centers of a pinhole, where and as `like` is."""
+    """Return (H, W, 3) unit directions in the world through all pixel centers, where and as `like` is.
+
+    They are 0 where the lens sees nothing.
+    """
     turn = torch.tensor(camera.world_to_camera[:3, :3].tolist(), dtype=like.dtype, device=like.device)
+    if camera.model != "PINHOLE":
+        return _lens_directions(lens_of(camera), like.device, like.dtype) @ turn
     x, y = (
         ((torch.arange(count, dtype=torch.float64) + 0.5 - center) / focal).to(like.device, like.dtype)
         for count, center, focal in (
@@ -339,9 +350,22 @@ def directions(camera: Camera, like: Tensor) -> Tensor:
     return torch.nn.functional.normalize(local, dim=2) @ turn
 
 
-def warp(image: Tensor, lens: Warp) -> Tensor:
-    """Return what a lens sees of its pinhole's picture; as in `contract`."""
-    return lens.apply(image)
+@lru_cache(maxsize=64)
+def _lens_directions(lens: Lens, device: torch.device, dtype: torch.dtype) -> Tensor:
+    """The same in camera axes; those of the last 64 lenses are kept (12 bytes per pixel each), since they are dear."""
+    camera = camera_of(lens)
+    _, rays = camera.rays()
+    return torch.from_numpy(np.nan_to_num(rays)).reshape(camera.height, camera.width, 3).to(device, dtype)
+
+
+def native_lens(camera: Camera) -> bool:
+    """Return whether the lens can be drawn as it is: pinholes alone (but `decode` takes any)."""
+    return camera.model == "PINHOLE"
+
+
+def warp(rendering: Rendering, lens: Warp, background: Tensor | None = None) -> Rendering:
+    """Return what a lens sees of its pinhole's rendering; as in `contract`."""
+    return lens.see(rendering, background)
 
 
 def ssim_map(image: Tensor, target: Tensor) -> Tensor:

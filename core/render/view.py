@@ -41,14 +41,16 @@ def render_view(
     `gaussians.features` have 3 columns, or 9 with a `decoder`; the rendering's `features` are colors (H, W, 3) either
     way, with what `contract` says of `alpha` and `depth`. `background` (3,) lies behind a lite model, black if None; a
     full model is drawn over zeros, because its decoder colors every pixel, and `background` is ignored. A lens with
-    distortion is drawn by a virtual pinhole and warped (`warp`). `rows` are the only ones drawn (`lifetimes`), without
+    distortion is drawn as it is where the backend can (`native_lens`, unless `Rules.warp_lenses`), else by a virtual
+    pinhole and warped (`warp`). `rows` are the only ones drawn (`lifetimes`), without
     `density`. Differentiable like the backends.
     """
     if rows is not None and decoder is not None:  # the time feature of the others would cost more than is saved
         gaussians, rows = listed(gaussians, rows), None
     if decoder is not None:
         gaussians, background = _with_time(gaussians, time, rules), None
-    if camera.model == "PINHOLE":
+    warped = camera.model != "PINHOLE" and bool(rules and rules.warp_lenses)
+    if not warped and backend.native_lens(camera):
         rendering = backend.rasterize_spacetime(gaussians, time, camera, background, rules, density, rows)
         return rendering if decoder is None else _decoded(backend, rendering, camera, decoder)
 
@@ -58,15 +60,7 @@ def render_view(
     rendering = backend.rasterize_spacetime(gaussians, time, warp.pinhole, None, rules, density, rows)
     if decoder is not None:
         rendering = _decoded(backend, rendering, warp.pinhole, decoder)
-    color, alpha, depth = rendering
-    # Depth is a mean weighted by alpha: both parts of the fraction are warped.
-    layers = backend.warp(torch.cat([color, alpha[..., None], (alpha * depth)[..., None]], dim=2), warp)
-    color, alpha, weighted = layers[..., :3], layers[..., 3].clamp(0.0, 1.0), layers[..., 4]
-    seen = alpha > 0.0
-    depth = torch.where(seen, weighted / torch.where(seen, alpha, 1.0), 0.0)
-    if background is not None:
-        color = color + (1.0 - alpha)[..., None] * background.to(color.device)
-    return Rendering(color, alpha, depth)
+    return backend.warp(rendering, warp, background)
 
 
 def _with_time(gaussians: SpacetimeTensors, time: float, rules: Rules | None) -> SpacetimeTensors:

@@ -9,7 +9,7 @@ of one position per pixel. Everything is linear in the picture, hence differenti
 import math
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -20,6 +20,7 @@ from torch.nn import functional
 
 from ..camera import MAX_SIZE, Camera
 from ..errors import HoloreelError
+from .contract import Rendering
 
 RESOLUTION = 1.0  # of the virtual picture's middle, in pixels per pixel of the real one
 MAX_AREA = 4.0  # of the virtual picture, in areas of the real one: the paper's "twice the size"
@@ -35,7 +36,7 @@ _MARGIN = 3  # virtual pixels around what is seen, for the bicubic kernel and ro
 class Warp:
     """How one camera's pictures come from those of its virtual pinhole.
 
-    `apply` is the plain torch way; `warp` of a backend does the same, on the CPU by the compiled kernels.
+    `apply` and `see` are the plain torch way; on the CPU, the compiled kernels do the same.
     """
 
     pinhole: Camera
@@ -58,6 +59,18 @@ class Warp:
             picture = functional.avg_pool2d(picture, self.samples)
         return picture[0].permute(1, 2, 0) * valid[..., None]
 
+    def see(self, rendering: Rendering, background: Tensor | None = None) -> Rendering:
+        """Warp a rendering over black: `warp` of the `contract`, in plain torch."""
+        color, alpha, depth = rendering
+        # Depth is a mean weighted by alpha: both parts of the fraction are warped.
+        layers = self.apply(torch.cat([color, alpha[..., None], (alpha * depth)[..., None]], dim=2))
+        color, alpha, weighted = layers[..., :-2], layers[..., -2].clamp(0.0, 1.0), layers[..., -1]
+        seen = alpha > 0.0
+        depth = torch.where(seen, weighted / torch.where(seen, alpha, 1.0), 0.0)
+        if background is not None:
+            color = color + (1.0 - alpha)[..., None] * background.to(color.device)
+        return Rendering(color, alpha, depth)
+
     def check(self, image: Tensor) -> None:
         """Raise ValueError unless the image is as large as `pinhole` draws it."""
         camera = self.pinhole
@@ -75,17 +88,36 @@ def lens_warp(camera: Camera) -> Warp:
 
     Raises `HoloreelError` for a lens that sees nothing.
     """
-    warp = _lens_warp(
-        (camera.model, camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy, camera.distortion)
-    )
+    warp = _lens_warp(lens_of(camera))
     return replace(warp, pinhole=replace(warp.pinhole, world_to_camera=camera.world_to_camera, name=camera.name))
 
 
+class Lens(NamedTuple):
+    """A camera without its place, as a key."""
+
+    width: int
+    height: int
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    model: str
+    distortion: tuple[float, ...]
+
+
+def lens_of(camera: Camera) -> Lens:
+    """Return what all cameras with the same lens share."""
+    return Lens(*(getattr(camera, name) for name in Lens._fields))
+
+
+def camera_of(lens: Lens) -> Camera:
+    """Return the camera with this lens that stands at the origin."""
+    return Camera(**lens._asdict())
+
+
 @lru_cache(maxsize=64)
-def _lens_warp(lens: tuple) -> Warp:
-    model, width, height, fx, fy, cx, cy, distortion = lens
-    real = Camera(width, height, fx, fy, cx, cy, model=model, distortion=distortion)
-    return make_warp(real)
+def _lens_warp(lens: Lens) -> Warp:
+    return make_warp(camera_of(lens))
 
 
 def make_warp(real: Camera, resolution: float = RESOLUTION, samples: int = SAMPLES) -> Warp:

@@ -4,19 +4,23 @@
 The backends that run on a GPU are skipped by name where there is none.
 """
 
+import inspect
 import math
 import sys
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import NamedTuple
 
+import numpy as np
 import pytest
 import torch
 from holoreel.core.camera import Camera
 from holoreel.core.errors import HoloreelError
+from holoreel.core.gaussians.decoder import Decoder
 from holoreel.core.render import get_backend, reference
-from holoreel.core.render.contract import AdamGroup, DensityStats, Rules, SpacetimeTensors
+from holoreel.core.render.contract import AdamGroup, DensityStats, Rendering, Rules, SpacetimeTensors
 from holoreel.core.render.scenes import random_scene
+from holoreel.core.render.view import render_view
 
 TIME = 0.4
 
@@ -104,9 +108,18 @@ def stand_in(
     backgrounds,
     render_mode,
     packed,
+    with_ut=False,
+    with_eval3d=False,
+    camera_model="pinhole",
+    radial_coeffs=None,
+    tangential_coeffs=None,
 ):
-    """What gsplat's `rasterization` returns for these arguments, made of the oracle's parts."""
-    assert (render_mode, packed) == ("RGB+ED", False)
+    """What gsplat's `rasterization` returns, made of the oracle's parts; lenses must not distort."""
+    assert (render_mode, packed, camera_model) == ("RGB+ED", False, "pinhole")
+    assert with_ut == with_eval3d == (radial_coeffs is not None) == (tangential_coeffs is not None)
+    if with_ut:
+        assert torch.equal(radial_coeffs, torch.zeros(1, 6))
+        assert torch.equal(tangential_coeffs, torch.zeros(1, 2))
     (fx, _, cx), (_, fy, cy), _ = Ks[0].tolist()
     camera = Camera(width, height, fx, fy, cx, cy, viewmats[0].double().numpy())
     rules = replace(GSPLAT.rules, near=near_plane, low_pass=eps2d)
@@ -115,6 +128,7 @@ def stand_in(
     splats = reference.project(gaussians, torch.arange(count), camera, rules)
     places = torch.zeros(1, count, 2).index_put((torch.zeros_like(splats.rows), splats.rows), splats.means)
     splats = splats._replace(means=places[0, splats.rows])
+    places = places.detach() if with_ut else places  # what the unscented transform finds carries no gradient
     sums = reference.composite(splats, width, height, rules)
     alpha = sums[..., -1:]
     features = sums[..., :-2] + (1 - alpha) * (0 if backgrounds is None else backgrounds[0])
@@ -255,3 +269,131 @@ def test_gsplat_is_told_the_same_scene(card):
     torch.testing.assert_close(means[0, ours.rows], ours.means)
     torch.testing.assert_close(depths[0, ours.rows], ours.depths)
     torch.testing.assert_close(conics[0, ours.rows], ours.conics)
+
+
+LENSES = {
+    "OPENCV": (-0.1, 0.02, 0.001, -0.002),
+    "FULL_OPENCV": (0.1, 0.2, 0.001, -0.002, 0.03, 0.12, 0.19, 0.02),
+    "OPENCV_FISHEYE": (0.05, -0.01, 0.002, -0.001),
+}
+
+
+def bent(model, *distortion, focal=90.0):
+    return Camera(130, 90, focal, 1.05 * focal, 60.0, 50.0, model=model, distortion=distortion)
+
+
+def test_lenses_that_gsplat_draws():
+    """All that the camera sees must be seen by gsplat, which gives up early on strong distortion."""
+    from holoreel.core.render import cpu, cuda
+
+    for model, distortion in LENSES.items():
+        assert cuda.native_lens(bent(model, *distortion))
+        assert not cpu.native_lens(bent(model, *distortion))
+        assert not reference.native_lens(bent(model, *distortion))
+    assert all(module.native_lens(bent("PINHOLE")) for module in (cpu, cuda, reference))
+    assert not cuda.native_lens(bent("OPENCV", -0.3, 0.03, 0, 0, focal=60.0))  # a factor of 0.6 in the corners
+    assert not cuda.native_lens(bent("OPENCV", -0.5, 0, 0, 0, focal=60.0))  # the corners see nothing
+    assert not cuda.native_lens(bent("OPENCV_FISHEYE", 0, 0, 0, 0, focal=45.0))  # corners at more than 90 degrees
+    assert not cuda.native_lens(bent("OPENCV_FISHEYE", -0.2, 0, 0, 0))  # corners beyond what gsplat takes for the field
+
+
+def test_gsplat_is_told_the_lens():
+    from holoreel.core.render import cuda
+
+    like = torch.zeros(1)
+    told = cuda.camera_arguments(bent("FULL_OPENCV", 1, 2, 3, 4, 5, 6, 7, 8), like)
+    assert told["radial_coeffs"].tolist() == [[1, 2, 5, 6, 7, 8]]
+    assert told["tangential_coeffs"].tolist() == [[3, 4]]
+    assert (told["camera_model"], told["with_ut"], told["with_eval3d"]) == ("pinhole", True, True)
+    told = cuda.camera_arguments(bent("OPENCV", 1, 2, 3, 4), like)
+    assert told["radial_coeffs"].tolist() == [[1, 2, 0, 0, 0, 0]]
+    assert told["tangential_coeffs"].tolist() == [[3, 4]]
+    told = cuda.camera_arguments(bent("OPENCV_FISHEYE", 1, 2, 3, 4), like)
+    assert told["radial_coeffs"].tolist() == [[1, 2, 3, 4]]
+    assert (told["camera_model"], "tangential_coeffs" in told) == ("fisheye", False)
+    assert "with_ut" not in cuda.camera_arguments(bent("PINHOLE"), like)
+    with pytest.raises(ValueError, match="PINHOLE"):
+        cuda.rasterize_spacetime(random_scene(5, 40, 30, 3)[0], TIME, bent("OPENCV", -0.5, 0, 0, 0, focal=60.0))
+
+
+@pytest.mark.parametrize("backend", [STAND_IN], indirect=True)
+def test_a_lens_drawn_as_it_is(backend):
+    """Without distortion it is a pinhole: the same picture; statistics of density come from the means in space."""
+    backend, promise = backend
+    gaussians, pinhole = plain(3)
+    lens = replace(pinhole, model="OPENCV", distortion=(0.0,) * 4)
+    size = (pinhole.height, pinhole.width)
+    incoming = [torch.randn(*size, 3), torch.zeros(size), torch.zeros(size)]
+    oracle, _, wanted = draw(reference, torch.float64, gaussians, pinhole, promise.rules, incoming)
+    ours, _, got = draw(backend, torch.float32, gaussians, lens, promise.rules, incoming)
+    apart = (ours[0] - oracle[0]).abs().amax(2)
+    assert (apart > promise.pixel).double().mean() <= promise.bad_pixels
+    both = (got.views > 0) & (wanted.views > 0)
+    assert both.sum() > 0.9 * (wanted.views > 0).sum()
+    ratio = got.gradient[both] / wanted.gradient[both]
+    assert 0.7 < ratio.median() < 1.4
+
+
+@pytest.mark.parametrize("backend", [STAND_IN], indirect=True)
+def test_view_warps_only_what_the_backend_cannot_draw(backend, monkeypatch):
+    backend, _ = backend
+    drawn = []
+    monkeypatch.setattr(
+        backend, "rasterize_spacetime", lambda g, time, camera, *_: drawn.append(camera) or reference_picture(camera)
+    )
+
+    def reference_picture(camera):
+        return Rendering(*(torch.zeros(camera.height, camera.width, *rest) for rest in ((3,), (), ())))
+
+    gaussians, _ = plain(3)
+    lens = bent("OPENCV", *LENSES["OPENCV"])
+    too_strong = bent("OPENCV", -0.3, 0.03, 0, 0, focal=60.0)
+    for camera, rules, native in (
+        (lens, None, True),
+        (lens, Rules(), True),
+        (lens, Rules(warp_lenses=True), False),
+        (too_strong, None, False),
+        (bent("PINHOLE"), Rules(warp_lenses=True), True),
+    ):
+        picture = render_view(backend, gaussians, TIME, camera, rules=rules)
+        assert picture.alpha.shape == (camera.height, camera.width)
+        assert (drawn.pop() is camera) == native
+
+
+@pytest.mark.parametrize("model", LENSES)
+@pytest.mark.parametrize("activation", ["none", "clamp", "sigmoid"])
+def test_decode_along_the_rays_of_a_lens(model, activation):
+    """Against the float64 decoder; black where the lens sees nothing."""
+    camera = replace(bent(model, *LENSES[model]), world_to_camera=turned()[1].world_to_camera)
+    if model == "OPENCV":
+        camera = replace(camera, distortion=(-0.5, 0.0, 0.0, 0.0), fx=60.0)
+    generator = np.random.default_rng(3)
+    features, hidden, output = (
+        generator.normal(size=size).astype(np.float32) for size in ((90, 130, 9), (6, 12), (3, 6))
+    )
+    origins, rays = (values.reshape(90, 130, 3) for values in camera.rays())
+    wanted = Decoder(hidden, output, activation).decode(features, origins, np.nan_to_num(rays))
+    wanted[np.isnan(rays).any(axis=2)] = 0
+    assert np.isnan(rays).any() == (model == "OPENCV")
+    tensors = (torch.from_numpy(array).double() for array in (features, hidden, output))
+    ours = reference.decode(next(tensors), camera, *tensors, activation).numpy()
+    np.testing.assert_allclose(ours, wanted, atol=1e-9)
+
+
+@pytest.mark.parametrize("model", ["PINHOLE", *LENSES])
+def test_gsplat_has_these_arguments(model, monkeypatch):
+    gsplat = pytest.importorskip("gsplat")
+    from holoreel.core.render import cuda
+
+    told = {}
+    signature = inspect.signature(gsplat.rasterization)
+
+    def rasterization(**arguments):
+        told.update(signature.bind(**arguments).arguments)
+        camera = arguments["width"], arguments["height"]
+        return torch.zeros(1, *camera[::-1], 4), torch.zeros(1, *camera[::-1], 1), {}
+
+    monkeypatch.setattr(cuda, "DEVICE", "cpu")
+    monkeypatch.setattr(gsplat, "rasterization", rasterization)
+    cuda.rasterize_spacetime(plain(3)[0], TIME, bent(model, *LENSES.get(model, ())))
+    assert told["render_mode"] == "RGB+ED"

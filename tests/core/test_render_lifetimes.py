@@ -7,7 +7,8 @@ from itertools import pairwise
 import numpy as np
 import pytest
 import torch
-from holoreel.core.camera import Camera
+from holoreel.core.camera import Camera, read_camera
+from holoreel.core.draw import Player
 from holoreel.core.errors import HoloreelError
 from holoreel.core.render import cpu, reference
 from holoreel.core.render.contract import DensityStats, Rules, SpacetimeTensors, listed
@@ -111,3 +112,19 @@ def test_bad_lists_are_refused() -> None:
     density = DensityStats(torch.zeros(50), torch.zeros(50, dtype=torch.int32), torch.zeros(50))
     with pytest.raises(ValueError, match="density"):
         cpu.rasterize_spacetime(gaussians, 0.4, camera, None, None, density, torch.zeros(1, dtype=torch.int32))
+
+
+def test_the_player_lists_unless_all_shall_be_drawn(recording, monkeypatch) -> None:
+    """What is timed as the authors draw must not profit from lists."""
+    player = Player(recording.reel, "cpu")
+    seen = []
+    honest = cpu.rasterize_spacetime
+    monkeypatch.setattr(cpu, "rasterize_spacetime", lambda *a, **k: seen.append(a[6]) or honest(*a, **k))
+    camera = read_camera(recording.camera)
+    pictures = [
+        player.draw(camera, player.frame_start + 0.3, **options)
+        for options in ({}, {"listed": False}, {"rules": Rules(cull_faded=False)}, {"rules": Rules(alpha_min=1e-3)})
+    ]
+    assert [rows is None for rows in seen] == [False, True, True, True]
+    for picture in pictures[1:3]:
+        assert all(np.array_equal(a, b) for a, b in zip(picture, pictures[0], strict=True))

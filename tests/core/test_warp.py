@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Warping a virtual pinhole's picture to a real lens: where points land, gradients, what no distortion means."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
@@ -9,8 +9,8 @@ import pytest
 import torch
 from holoreel.core.camera import Camera
 from holoreel.core.errors import HoloreelError
-from holoreel.core.render import cpu
-from holoreel.core.render.contract import Rules
+from holoreel.core.render import cpu, reference
+from holoreel.core.render.contract import Rendering, Rules
 from holoreel.core.render.reference import rasterize
 from holoreel.core.render.warp import MAX_AREA, MAX_FIELD_DEGREES, Warp, lens_warp, make_warp
 
@@ -138,14 +138,23 @@ def lanes(request: pytest.FixtureRequest) -> Iterator[int]:
     cpu.set_lanes(0)
 
 
-def with_gradient(apply: Callable[[torch.Tensor], torch.Tensor], picture: torch.Tensor) -> list[torch.Tensor]:
-    """What comes out of it, and the gradient of a random sum of that."""
-    picture = picture.clone().requires_grad_()
-    seen = apply(picture)
-    incoming = torch.randn(seen.shape, generator=torch.Generator().manual_seed(1)).to(seen.dtype)
-    seen.backward(incoming)
+def incoming_gradient(warp: Warp, channels: int) -> torch.Tensor:
+    """A random one."""
+    return torch.randn(*warp.valid.shape, channels, generator=torch.Generator().manual_seed(1))
+
+
+def by_torch(picture: torch.Tensor, warp: Warp) -> list[torch.Tensor]:
+    """What comes out of it, and the gradient of a random sum of that, in float64."""
+    picture = picture.double().requires_grad_()
+    seen = warp.apply(picture)
+    seen.backward(incoming_gradient(warp, picture.shape[2]).double())
     assert picture.grad is not None
     return [seen.detach(), picture.grad]
+
+
+def by_kernels(picture: torch.Tensor, warp: Warp) -> list[torch.Tensor]:
+    """The same."""
+    return [cpu.warp_layers(picture, warp), cpu.spread_layers(incoming_gradient(warp, picture.shape[2]), warp)]
 
 
 @pytest.mark.parametrize("model", LENSES)
@@ -157,8 +166,7 @@ def test_kernels_do_as_torch(model: str, samples: int, channels: int, lanes: int
     warp = replace(make_warp(view), samples=samples)
     size = (warp.pinhole.height, warp.pinhole.width, channels)
     picture = torch.rand(size, generator=torch.Generator().manual_seed(0))
-    oracle = with_gradient(warp.apply, picture.double())
-    for ours, wanted in zip(with_gradient(lambda image: cpu.warp(image, warp), picture), oracle, strict=True):
+    for ours, wanted in zip(by_kernels(picture, warp), by_torch(picture, warp), strict=True):
         assert (ours - wanted).abs().max() <= 1e-5
     assert warp.valid.all() == (model != "OPENCV_FISHEYE")
 
@@ -172,8 +180,7 @@ def test_kernels_know_the_border_of_the_picture(samples: int, lanes: int) -> Non
     warp = Warp(pinhole, torch.rand(38, 129, generator=generator) < 0.8, samples, places)
     for channels in (1, 5, 11):
         picture = torch.rand(7, 9, channels, generator=generator)
-        oracle = with_gradient(warp.apply, picture.double())
-        for ours, wanted in zip(with_gradient(lambda image: cpu.warp(image, warp), picture), oracle, strict=True):
+        for ours, wanted in zip(by_kernels(picture, warp), by_torch(picture, warp), strict=True):
             assert (ours - wanted).abs().max() <= 1e-5 * wanted.abs().max()
 
 
@@ -183,15 +190,43 @@ def test_kernels_give_the_same_for_any_number_of_threads() -> None:
     before, results = cpu.get_threads(), []
     for threads in (1, 2, 5):
         cpu.set_threads(threads)
-        results.append(with_gradient(lambda image: cpu.warp(image, warp), picture))
+        results.append(by_kernels(picture, warp))
     cpu.set_threads(before)
     for result in results[1:]:
         assert all(torch.equal(a, b) for a, b in zip(result, results[0], strict=True))
 
 
+@pytest.mark.parametrize("background", [None, (0.0, 0.0, 0.0), (0.2, 0.5, 0.9)])
+@pytest.mark.parametrize("asked", ["color", "alpha", "depth", "all"])
+def test_renderings_are_seen_as_by_torch(background: tuple[float, ...] | None, asked: str) -> None:
+    """Whichever of the three has a gradient; parts are empty, and bicubic samples overshoot beside the full ones."""
+    warp = replace(lens_warp(camera("OPENCV_FISHEYE", 60, 40, 20.0)), samples=2)
+    generator = torch.Generator().manual_seed(4)
+    size = (warp.pinhole.height, warp.pinhole.width)
+    alpha = (3 * torch.rand(size, generator=generator) - 1).clamp(0, 1)
+    alpha[: size[0] // 2, : size[1] // 2] = 0
+    parts = (torch.rand(*size, 3, generator=generator), alpha, 1 + torch.rand(size, generator=generator))
+    weights = [torch.randn(40, 60, *rest, generator=generator) for rest in ((3,), (), ())]
+    results = []
+    for backend, dtype in ((cpu, torch.float32), (reference, torch.float64)):
+        tensors = [part.to(dtype, copy=True).requires_grad_() for part in parts]
+        behind = None if background is None else torch.tensor(background, dtype=dtype, requires_grad=any(background))
+        seen = backend.warp(Rendering(*tensors), warp, behind)
+        chosen = range(3) if asked == "all" else [("color", "alpha", "depth").index(asked)]
+        # Where hardly anything is, depth is a fraction of rounding errors.
+        solid = seen.alpha.detach() > 0.05
+        sum((seen[k] * weights[k].to(dtype) * (solid if k == 2 else 1)).sum() for k in chosen).backward()
+        leaves = tensors if behind is None or not behind.requires_grad else [*tensors, behind]
+        gradients = [torch.zeros_like(leaf) if leaf.grad is None else leaf.grad for leaf in leaves]
+        results.append([seen.features, seen.alpha, seen.depth * solid, *gradients])
+    assert len(results[0]) == len(results[1])
+    for ours, wanted in zip(*results, strict=True):
+        assert (ours - wanted).abs().max() <= 2e-5 * max(1.0, float(wanted.detach().abs().max()))
+
+
 def test_kernels_refuse_what_they_cannot_warp() -> None:
     warp = lens_warp(camera("OPENCV"))
     with pytest.raises(ValueError, match="not"):
-        cpu.warp(torch.ones(3, 3, 1), warp)
+        cpu.warp(Rendering(torch.ones(3, 3, 1), torch.ones(3, 3), torch.ones(3, 3)), warp)
     with pytest.raises(HoloreelError, match="1 to 16 channels"):
-        cpu.warp(torch.ones(warp.pinhole.height, warp.pinhole.width, 17), warp)
+        cpu.warp_layers(torch.ones(warp.pinhole.height, warp.pinhole.width, 17), warp)
