@@ -116,13 +116,17 @@ class GuidedConfig:
     """the loss is stable when it falls by less than this part of itself over a fiftieth of the run"""
     patch: int = 16
     """pixels along a side of the patches over which errors are averaged"""
-    share: float = 0.01
+    share: float = 0.03
     """at most this part of all patches is sampled"""
-    contrast: float = 4.0
+    contrast: float = 2.0
     """only patches whose error is this many times the median patch's are sampled"""
+    sparse: float = 0.25
+    """only patches into which fewer seeds fall than this part of the mean are sampled"""
     samples: int = 8
     """new Gaussians along each ray"""
-    far: float = 1.2
+    near: float = 0.7
+    """rays begin at this part of the largest depth the camera sees"""
+    far: float = 7.5
     """rays end at this multiple of the largest depth the camera sees"""
     noise: float = 0.1
     """of the new centers, in patches"""

@@ -8,7 +8,7 @@ Gaussians along the ray. Those that are not needed turn transparent and are prun
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,34 +20,40 @@ from .model import SpacetimeGaussians
 Floats = NDArray[np.float32]
 
 OPAQUE = 0.5  # where a pixel lets more light through, its depth says nothing
-NEAR_SHARE, FAR_SHARE = 0.02, 0.98  # of a picture's depths: outside lie strays
+FAR_SHARE = 0.98  # of a picture's depths: farther out lie strays
 SIGMA_PATCHES = 0.25  # standard deviation of a new Gaussian, in patches
 
 
 @dataclass(frozen=True)
 class Patches:
-    """P patches of one picture: `centers` (P, 2) in pixels, mean `errors` (P,), mean `colors` of the truth (P, 3)."""
+    """P patches of one picture: `centers` (P, 2) in pixels, mean `errors` (P,), mean `colors` of the truth (P, 3).
+
+    `sparse` (P,) says which of them few seeds fall into: where Gaussians are missing, not where they are hard to fit.
+    """
 
     centers: NDArray[np.float64]
     errors: Floats
     colors: Floats
+    sparse: NDArray[np.bool_]
 
     def take(self, rows: NDArray[np.int64]) -> "Patches":
         """Return some of the patches."""
-        return Patches(self.centers[rows], self.errors[rows], self.colors[rows])
+        return Patches(self.centers[rows], self.errors[rows], self.colors[rows], self.sparse[rows])
 
 
 def measure_patches(picture: Floats, truth: Floats, size: int, valid: NDArray[np.bool_] | None = None) -> Patches:
     """Average the absolute error of a picture (H, W, 3) over patches of `size` × `size` pixels.
 
-    Patches that do not fit into the picture, or hold a pixel that is not `valid` (H, W), are left out.
+    Patches that do not fit into the picture, or hold a pixel that is not `valid` (H, W), are left out. All count as
+    sparse: `with_seeds` knows better.
     """
     rows, columns = picture.shape[0] // size, picture.shape[1] // size
     error = _blocks(np.abs(picture - truth).mean(axis=2, keepdims=True), rows, columns, size)[:, 0]
     colors = _blocks(truth, rows, columns, size)
     v, u = np.mgrid[:rows, :columns]
     centers = (np.stack([u.ravel(), v.ravel()], axis=1) + 0.5) * size
-    patches = Patches(centers, error.astype(np.float32), colors.astype(np.float32))
+    sparse = np.ones(len(centers), dtype=bool)
+    patches = Patches(centers, error.astype(np.float32), colors.astype(np.float32), sparse)
     if valid is None:
         return patches
     whole = _blocks(valid[..., None].astype(np.float32), rows, columns, size)[:, 0] == 1.0
@@ -60,18 +66,32 @@ def _blocks(image: NDArray, rows: int, columns: int, size: int) -> NDArray:
     return whole.reshape(rows, size, columns, size, -1).mean(axis=(1, 3)).reshape(rows * columns, -1)
 
 
+def with_seeds(patches: Patches, size: int, camera: Camera, seeds: Floats, share: float) -> Patches:
+    """Call those patches sparse into which fewer `seeds` (N, 3) fall than a `share` of the mean of all patches."""
+    uv, depth = camera.project(seeds)
+    seen = uv[(depth > 0) & np.isfinite(uv).all(axis=1)]
+    cells = np.floor(seen / size).astype(np.int64)
+    rows, columns = camera.height // size + 1, camera.width // size + 1
+    inside = (cells >= 0).all(axis=1) & (cells < (columns, rows)).all(axis=1)
+    counts = np.zeros((rows, columns))
+    np.add.at(counts, (cells[inside, 1], cells[inside, 0]), 1.0)
+    column, row = np.floor(patches.centers / size).astype(np.int64).T
+    own = counts[row, column]
+    return replace(patches, sparse=own < share * own.mean() if own.any() else np.ones(len(own), dtype=bool))
+
+
 def worst_patches(pictures: Sequence[Patches], share: float, contrast: float) -> list[Patches]:
-    """Return, picture by picture, the patches with the largest errors of all.
+    """Return, picture by picture, the sparse patches with the largest errors.
 
     They are at most a `share` of all patches, and their error is at least `contrast` times that of the median patch.
     """
     errors = np.concatenate([patches.errors for patches in pictures])
     if not len(errors):
         return list(pictures)
-    order = np.argsort(-errors, kind="stable")[: math.ceil(share * len(errors))]
-    chosen = np.zeros(len(errors), dtype=bool)
-    chosen[order] = True
+    chosen = np.concatenate([patches.sparse for patches in pictures])
     chosen &= (errors >= contrast * np.median(errors)) & (errors > 0)
+    order = np.argsort(np.where(chosen, -errors, 0.0), kind="stable")
+    chosen[order[math.ceil(share * len(errors)) :]] = False
     starts = np.cumsum([0, *(len(patches) for patches in (p.errors for p in pictures))])
     return [
         patches.take(np.flatnonzero(chosen[start : start + len(patches.errors)]))
@@ -79,44 +99,37 @@ def worst_patches(pictures: Sequence[Patches], share: float, contrast: float) ->
     ]
 
 
-def depth_range(depth: Floats, alpha: Floats, patches: Patches, size: int, far: float) -> NDArray[np.float64] | None:
-    """Return how near and how far the ray of each patch should reach, (P, 2), from a camera's coarse depth map.
+def depth_range(depth: Floats, alpha: Floats, near: float, far: float) -> tuple[float, float] | None:
+    """Return how near and how far rays should reach, from a camera's coarse depth map and alpha, both (H, W).
 
-    `depth` and `alpha` are (H, W). A ray begins at the nearest that the patch and its neighbors show (where they show
-    nothing, that the camera sees), so that nothing is put before what is known to be free, and ends at `far` times the
-    farthest that the camera sees. None where it sees none.
+    From `near` to `far` times the farthest depth that the camera sees; None where it sees none. What seeds leave out
+    lies as far as what they show or farther, and whatever is put before that hangs in the air for other cameras.
     """
-    known = (alpha >= OPAQUE) & np.isfinite(depth) & (depth > 0)
-    if not known.any():
+    known = depth[(alpha >= OPAQUE) & np.isfinite(depth) & (depth > 0)]
+    if not len(known):
         return None
-    nearest, farthest = np.quantile(depth[known], (NEAR_SHARE, FAR_SHARE))
-    reach = np.empty((len(patches.errors), 2))
-    reach[:, 1] = farthest * far
-    for row, (u, v) in enumerate(patches.centers):
-        window = tuple(slice(max(int(x - 1.5 * size), 0), int(x + 1.5 * size)) for x in (v, u))
-        seen = depth[window][known[window]]
-        reach[row, 0] = np.quantile(seen, NEAR_SHARE) if len(seen) else nearest
-    reach[:, 0] = np.minimum(reach[:, 0], farthest)
-    return reach
+    farthest = float(np.quantile(known, FAR_SHARE))
+    return near * farthest, far * farthest
 
 
 def sample_rays(
     camera: Camera,
     patches: Patches,
     size: int,
-    reach: NDArray[np.float64],
+    reach: tuple[float, float],
     config: GuidedConfig,
     rng: np.random.Generator,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return points (P · samples, 3) along the rays through the patches' centers, and their sizes (P · samples,).
 
-    Depths are uniform over each patch's `reach` (P, 2), one in each of equal stretches; centers are off by a little
-    noise. A size is the standard deviation that covers the patch.
+    Depths lie between both ends of `reach`, one in each of stretches that grow with the depth as a picture's resolution
+    falls: uniform in its logarithm. Centers are off by a little noise. A size is the standard deviation that covers the
+    patch.
     """
-    near, far = reach.T
+    near, far = reach
     count = len(patches.errors)
     steps = (np.arange(config.samples) + rng.random((count, config.samples))) / config.samples
-    depths = (near[:, None] + (far - near)[:, None] * steps).ravel()
+    depths = (near * (far / near) ** steps).ravel()
     pixels = np.repeat(patches.centers, config.samples, axis=0)
     pixels = pixels + rng.normal(0.0, config.noise * size, pixels.shape)
     points = camera.unproject(pixels, depths)

@@ -24,7 +24,16 @@ from ..render.view import DecoderTensors, render_view
 from .config import TrainConfig
 from .decoder import SHAPES, Decoder
 from .density import SETTINGS, DensityControl
-from .guided import Patches, Stability, depth_range, measure_patches, new_gaussians, sample_rays, worst_patches
+from .guided import (
+    Patches,
+    Stability,
+    depth_range,
+    measure_patches,
+    new_gaussians,
+    sample_rays,
+    with_seeds,
+    worst_patches,
+)
 from .mcmc import McmcControl
 from .model import SpacetimeGaussians
 from .parameters import Parameters, Rate
@@ -134,6 +143,7 @@ class Trainer:
             seeds = self._fitted(gaussians_from_points(points, config, np.random.default_rng(config.seed)))
         self.parameters = Parameters(as_trained(seeds, config), self._network(decoder), self.measure, self.device)
         self.inherited = inherited
+        self.seed_means = seeds.means.copy()  # the parameters may learn in the very same memory
         self.parameters.paces[:inherited] = config.inherited_pace
         self.pictures = PictureStream(capture, self.views, config.background, config.seed, config.picture_memory)
         control = DensityControl if config.strategy == "density" else McmcControl
@@ -311,8 +321,8 @@ class Trainer:
         room = self.config.density.max_gaussians - len(self.parameters)
         for view, patches, (_, depth, alpha) in zip(views, chosen, looked, strict=True):
             patches = patches.take(np.arange(min(len(patches.errors), max(room, 0) // config.samples)))
-            reach = depth_range(depth, alpha, patches, config.patch, config.far)
-            if reach is None or not len(reach):
+            reach = depth_range(depth, alpha, config.near, config.far)
+            if reach is None or not len(patches.errors):
                 continue
             camera = self.capture.cameras[view[0]]
             points, sizes = sample_rays(camera, patches, config.patch, reach, config, random)
@@ -330,9 +340,11 @@ class Trainer:
         truth = self.capture.image(*view, background=self.config.background).astype(np.float32) / 255.0
         rendering = self.render(camera, self.capture.time(view[1]))
         valid = valid_pixels(camera)
+        size, sparse = self.config.guided.patch, self.config.guided.sparse
         patches = measure_patches(
-            rendering.features.cpu().numpy(), truth, self.config.guided.patch, None if valid is None else valid.numpy()
+            rendering.features.cpu().numpy(), truth, size, None if valid is None else valid.numpy()
         )
+        patches = with_seeds(patches, size, camera, self.seed_means, sparse)
         return patches, rendering.depth.cpu().numpy(), rendering.alpha.cpu().numpy()
 
     def gaussians(self) -> SpacetimeGaussians:

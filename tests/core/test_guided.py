@@ -14,6 +14,7 @@ from holoreel.core.gaussians.guided import (
     measure_patches,
     new_gaussians,
     sample_rays,
+    with_seeds,
     worst_patches,
 )
 
@@ -42,12 +43,30 @@ def test_a_hole_is_the_worst_patch_and_nothing_else_is() -> None:
 
 def test_the_share_limits_and_even_errors_are_left_alone() -> None:
     errors = np.linspace(1.0, 1.9, 100).astype(np.float32)
-    even = Patches(np.zeros((100, 2)), errors, np.zeros((100, 3), np.float32))
+    even = Patches(np.zeros((100, 2)), errors, np.zeros((100, 3), np.float32), np.ones(100, bool))
     assert len(worst_patches([even], 0.5, 2.0)[0].errors) == 0
-    steep = Patches(np.zeros((100, 2)), errors**9, np.zeros((100, 3), np.float32))
+    steep = Patches(np.zeros((100, 2)), errors**9, np.zeros((100, 3), np.float32), np.ones(100, bool))
     chosen = worst_patches([steep], 0.05, 2.0)[0]
     np.testing.assert_array_equal(chosen.errors, np.sort(errors**9)[-5:])
     assert worst_patches([even.take(np.arange(0))], 0.5, 2.0)[0].errors.size == 0
+
+
+def test_patches_full_of_seeds_are_left_to_density_control() -> None:
+    picture, truth = picture_with_a_hole()
+    picture[0:8, 0:8] = 1.0  # as wrong as the hole
+    camera = Camera(60, 43, 60.0, 60.0, 30.0, 21.5)
+    patches = measure_patches(picture, truth, SIZE)
+    rng = np.random.default_rng(3)
+    pixels = rng.uniform([0, 0], [60, 43], (4000, 2))
+    hole = ((pixels >= (40, 16)) & (pixels < (48, 24))).all(axis=1)
+    seeds = camera.unproject(pixels[~hole], rng.uniform(2, 9, int((~hole).sum()))).astype(np.float32)
+    behind = np.float32([[0, 0, -3], [0.2, 0.1, -1]])  # would fall into the middle if depth were forgotten
+    known = with_seeds(patches, SIZE, camera, np.concatenate([seeds, behind]), 0.25)
+    assert np.flatnonzero(known.sparse).tolist() == [2 * 7 + 5]
+    (chosen,) = worst_patches([known], share=0.1, contrast=2.0)
+    np.testing.assert_array_equal(chosen.centers, [[44.0, 20.0]])
+    assert len(worst_patches([patches], share=0.1, contrast=2.0)[0].errors) == 2
+    assert with_seeds(patches, SIZE, camera, behind, 0.25).sparse.all()
 
 
 def test_patches_with_invalid_pixels_are_left_out() -> None:
@@ -59,24 +78,16 @@ def test_patches_with_invalid_pixels_are_left_out() -> None:
     assert patches.errors.max() < 0.02
 
 
-def at(*centers: tuple[float, float]) -> Patches:
-    """Patches at some pixels."""
-    count = len(centers)
-    return Patches(np.array(centers, np.float64), np.ones(count, np.float32), np.zeros((count, 3), np.float32))
-
-
-def test_rays_reach_from_what_their_surroundings_show_to_beyond_the_farthest() -> None:
+def test_rays_begin_and_end_by_the_farthest_that_is_seen() -> None:
     depth = np.tile(np.linspace(2.0, 6.0, 100, dtype=np.float32), (40, 1))
     alpha = np.ones_like(depth)
-    alpha[:, :50] = 0.2  # nearly nothing there: its depth says nothing
-    depth[0, 99] = np.nan
-    reach = depth_range(depth, alpha, at((80.0, 20.0), (20.0, 20.0), (96.0, 4.0)), SIZE, 1.5)
-    # Three patches around column 80 begin at column 68; around column 20 nothing is known.
-    np.testing.assert_allclose(reach[:, 0], [depth[1, 68], depth[1, 50], depth[1, 84]], rtol=0.01)
-    assert (reach[:, 1] > 1.5 * 5.8).all()
-    assert (reach[:, 1] <= 1.5 * 6.0).all()
-    assert depth_range(depth, 0 * alpha, at((80.0, 20.0)), SIZE, 1.5) is None
-    assert depth_range(depth, alpha, at(), SIZE, 1.5).shape == (0, 2)
+    alpha[:, 90:] = 0.2  # nearly nothing there: its depth says nothing
+    depth[0, 89] = np.nan
+    near, far = depth_range(depth, alpha, 0.7, 7.5)
+    farthest = depth[1, 87]  # all but 2 % of what is known lies nearer
+    assert near == pytest.approx(0.7 * farthest, rel=0.01)
+    assert far == pytest.approx(7.5 * farthest, rel=0.01)
+    assert depth_range(depth, 0 * alpha, 0.7, 7.5) is None
 
 
 @pytest.mark.parametrize("unit", [1e-3, 1.0, 1e4])
@@ -84,18 +95,17 @@ def test_new_gaussians_lie_on_the_rays_and_within_reach(unit: float) -> None:
     eye, target = np.array([3.0, -4.0, 2.0]) * unit, np.array([0.5, 0.2, 0.1]) * unit
     camera = Camera.look_at(tuple(eye), tuple(target), width=60, height=43, fx=70.0)
     centers = np.array([[44.0, 20.0], [4.0, 36.0]])
-    patches = Patches(centers, np.ones(2, np.float32), np.eye(3, dtype=np.float32)[:2])
+    patches = Patches(centers, np.ones(2, np.float32), np.eye(3, dtype=np.float32)[:2], np.ones(2, bool))
     config = GuidedConfig(samples=16, noise=0.05)
-    reach = np.array([[2.0, 9.0], [5.0, 6.0]]) * unit
-    points, sizes = sample_rays(camera, patches, SIZE, reach, config, np.random.default_rng(0))
+    near, far = 2.0 * unit, 9.0 * unit
+    points, sizes = sample_rays(camera, patches, SIZE, (near, far), config, np.random.default_rng(0))
     uv, depth = camera.project(points)
     assert points.shape == (32, 3)
     off = np.abs(uv - np.repeat(centers, 16, axis=0))
     assert off.max() < 5 * 0.05 * SIZE
     assert off.max() > 0
-    # One in each sixteenth of the reach: uniform, and no stretch is left out.
-    near, far = np.repeat(reach, 16, axis=0).T
-    stretch = np.floor((depth - near) / (far - near) * 16).reshape(2, 16)
+    # One in each sixteenth of the reach's logarithm: uniform, and no stretch is left out.
+    stretch = np.floor(np.log(depth / near) / np.log(far / near) * 16).reshape(2, 16)
     np.testing.assert_array_equal(stretch, np.tile(np.arange(16.0), (2, 1)))
     # Three standard deviations to each side cover the patch, and not much more.
     np.testing.assert_allclose(sizes * 70.0 / depth, SIZE / 4)

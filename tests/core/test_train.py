@@ -466,7 +466,7 @@ def test_guided_sampling_fills_a_hole_that_the_seeds_left(tmp_path: Path) -> Non
     holey = replace(whole, seeds=seeds)
     psnr = {}
     for times in (0, 3):
-        config = TrainConfig(iterations=300, guided=GuidedConfig(times=times, patch=8))
+        config = TrainConfig(iterations=300, guided=GuidedConfig(times=times, patch=8, far=1.4))
         trainer = Trainer(holey, config, get_backend())
         trainer.run(lambda progress: None)
         assert len(trainer.guided_at) == times
