@@ -166,7 +166,7 @@ class TrainConfig:
     """loss = (1 − w) L1 + w (1 − SSIM) (Sec. 4.3)"""
     segment: int = 50
     """longer captures are cut into segments of at most so many frames, each a model of its own; 0: never"""
-    overlap: int = 0
+    overlap: int = 2
     """frames beyond its own on either side that a segment learns from too"""
     share_static: bool = True
     """let a segment begin with what stood still in the one before it, so that nothing jumps between them"""
