@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 Parameters = tuple[float, ...]
 
-_STEPS = 80  # of an iteration; it takes about 6 unless the lens is at its limit
+_STEPS = 400  # of an iteration; it takes about 6, but halves brackets of 1e100 for points beside the camera
 _RESIDUAL = 1e-12  # of the plane, relative to 1 + the distance from its middle: no more is a solution
 _ENOUGH = 1e-14  # the same: no less is sought
 
@@ -194,9 +194,11 @@ def _fisheye_from_plane(k: Parameters, plane: Array) -> Array:
 def _invert_increasing(
     function: Callable[[Array], tuple[Array, Array]], target: Array, limit: float, tolerance: float = 2e-16
 ) -> Array:
-    """Solve function(x) = target ≥ 0 for x in [0, limit): Newton's steps inside a bracket that shrinks; NaN beyond.
+    """Solve function(x) = target ≥ 0 for x in [0, limit); NaN beyond.
 
-    `function` returns values and derivatives, is 0 at 0 and grows up to the limit. `tolerance` is relative, of x.
+    Newton's steps inside a bracket that shrinks; the bracket is halved where they leave it or shorten too slowly (from
+    far out on a high power they come back by a seventh at a time). `function` returns values and derivatives, is 0 at
+    0 and grows up to the limit, or to a pole there. `tolerance` is relative, of x.
     """
     low, high = np.zeros_like(target), np.full_like(target, limit)
     if math.isinf(limit):
@@ -206,19 +208,24 @@ def _invert_increasing(
             if not short.any():
                 break
             high[short] *= 2
-    inside = target < function(high)[0]
+    ceiling = function(high)[0]
+    inside = (target < ceiling) | ~(ceiling > 0)  # rounding puts a pole's own value on either side of it
     result = np.full_like(target, np.nan)
     todo = np.flatnonzero(inside)
     target, low, high = target[todo], low[todo], high[todo]
     x = np.minimum(target, (low + high) / 2)
+    step = high.copy()
     for _ in range(_STEPS):
         value, slope = function(x)
         low, high = np.where(value <= target, x, low), np.where(value >= target, x, high)
         following = x - (value - target) / slope
-        following = np.where((following >= low) & (following <= high), following, (low + high) / 2)
-        more = np.abs(following - x) > tolerance * x
+        fast = (following >= low) & (following <= high) & (np.abs(following - x) <= step / 2)
+        following = np.where(fast, following, (low + high) / 2)
+        step = np.abs(following - x)
+        more = step > tolerance * x
         result[todo] = following
-        todo, target, low, high, x = todo[more], target[more], low[more], high[more], following[more]
+        todo, target, low, high = todo[more], target[more], low[more], high[more]
+        x, step = following[more], step[more]
         if not len(todo):
             break
     return result

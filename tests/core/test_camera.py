@@ -13,7 +13,7 @@ import pytest
 from holoreel.core.camera import Camera, focal_from_fov, read_camera, write_camera
 from holoreel.core.errors import HoloreelError
 from holoreel.core.lens import brown_limit, fisheye_limit
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 numbers = st.floats(-20, 20, allow_nan=False)
@@ -79,6 +79,8 @@ def lenses(draw: st.DrawFn) -> Camera:
 
 
 @given(lenses(), st.integers(0, 2**32 - 1))
+@example(lens("FULL_OPENCV", (0, 0, 0, 0, 0.125, 0, 0, 0)), 0)  # a seventh power: pixels of 1e17
+@example(lens("FULL_OPENCV", (-0.4, 0, 0, 0, 0.1, 0.5, 0.1, -0.1)), 0)  # a pole, whose value rounding makes negative
 @settings(max_examples=100, deadline=None)
 def test_lenses_are_invertible_where_they_see(camera: Camera, seed: int) -> None:
     """Pixels to points and back to 1e-9 px; what a lens sees it sees at one pixel, and that pixel sees it."""

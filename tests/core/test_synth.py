@@ -200,7 +200,10 @@ def test_killed_in_the_middle_and_resumed(
     code = "import sys; from holoreel.core.cli import main; sys.exit(main(sys.argv[1:]))"
     environment = os.environ | {"HOLOREEL_BLENDER": str(blender.path)}
     process = subprocess.Popen(
-        [sys.executable, "-c", code, *command(job, out)], stderr=subprocess.DEVNULL, env=environment
+        [sys.executable, "-c", code, *command(job, out)],
+        stderr=subprocess.DEVNULL,
+        env=environment,
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),  # a background job ignores it
     )
     while len(list(out.glob("images/cam*/??????.png"))) < 2:
         assert process.poll() is None

@@ -17,7 +17,7 @@ namespace holoreel {
 
 namespace {
 
-constexpr int kReach = 5, kTaps = 2 * kReach + 1, kBand = 48;  // rows per task
+constexpr int kReach = 5, kTaps = 2 * kReach + 1, kBand = 90;  // rows per task
 constexpr float kC1 = 0.01f * 0.01f, kC2 = 0.03f * 0.03f;
 
 struct Window {
