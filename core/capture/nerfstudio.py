@@ -8,7 +8,10 @@ frame). Files without them are read too: entries of one pose and lens are one ca
 
 Lenses are OpenCV's, as nerfstudio's: `camera_model` OPENCV has k1 k2 p1 p2 k3, and OPENCV_FISHEYE k1 k2 k3 k4; those
 that are missing are 0. FULL_OPENCV, which nerfstudio does not know, has k4 k5 k6 too. A picture may be a frame of a
-video: `file_path` then names the video, and `holoreel.video_frame` the frame, from 0.
+video: `file_path` then names the video, and `holoreel.video_frame` the frame, from 0. `mask_path` names a gray picture
+that is white where the subject is, or a video, of which `holoreel.mask_frame` is the frame. `holoreel.bounds` is a box
+around the subject over all frames ([lower corner, upper corner], in scene units), `holoreel.matte` the color (0 to 1)
+that pictures with masks lie over.
 """
 
 import os
@@ -22,7 +25,7 @@ from numpy.typing import NDArray
 from ..camera import MODELS, Camera, invert_rigid, rigid
 from ..errors import HoloreelError
 from ..files import finite, read_json, write_json
-from .capture import MAX_FRAMES, Capture, View
+from .capture import MAX_FRAMES, Capture, Triple, View
 from .media import Media, VideoFrame, media_path
 
 FILE_NAME = "transforms.json"
@@ -49,12 +52,13 @@ class _Entry:
     name: str | None  # camera name, where the file says so
     frame: int | None
     depth: Path | None
+    mask: Media | None
 
 
 def write_capture(path: str | Path, capture: Capture) -> Path:
     """Write `capture` as transforms.json (into `path` where that is a folder), atomically; return the file's path.
 
-    Pictures, depth maps and seed points stay where they are and are named relative to the file.
+    Pictures, depth maps, masks and seed points stay where they are and are named relative to the file.
     """
     path = _file(path)
     lenses = {name: _lens(camera) for name, camera in capture.cameras.items()}
@@ -72,6 +76,10 @@ def write_capture(path: str | Path, capture: Capture) -> Path:
         entry["holoreel"] = {"camera": name, "frame": frame}
         if isinstance(media, VideoFrame):
             entry["holoreel"]["video_frame"] = media.index
+        if mask := capture.masks.get((name, frame)):
+            entry["mask_path"] = _relative(media_path(mask), path)
+            if isinstance(mask, VideoFrame):
+                entry["holoreel"]["mask_frame"] = mask.index
         entries.append(entry)
         files[capture.split(name)].append(entry["file_path"])
     value: dict[str, Any] = dict(shared)
@@ -92,6 +100,8 @@ def write_capture(path: str | Path, capture: Capture) -> Path:
         "cameras": list(capture.cameras),
         "seeds": seeds if any(seeds) else [],
     }
+    value["holoreel"] |= {"bounds": capture.bounds} if capture.bounds else {}
+    value["holoreel"] |= {"matte": capture.matte} if capture.matte else {}
     write_json(path, value | {"frames": entries})
     return path
 
@@ -111,6 +121,7 @@ def read_capture(path: str | Path) -> Capture:
     frames, frame_count = _frames(path, entries, names, extra)
     images: dict[View, Media] = {}
     depths: dict[View, Path] = {}
+    masks: dict[View, Media] = {}
     for entry, name, frame in zip(entries, names, frames, strict=True):
         if (name, frame) in images:
             raise HoloreelError(
@@ -119,6 +130,8 @@ def read_capture(path: str | Path) -> Capture:
         images[name, frame] = entry.media
         if entry.depth:
             depths[name, frame] = entry.depth
+        if entry.mask:
+            masks[name, frame] = entry.mask
     capture = Capture(
         cameras=cameras,
         images=images,
@@ -128,6 +141,9 @@ def read_capture(path: str | Path) -> Capture:
         frame_start=_integer(path, "holoreel.frame_start", extra.get("frame_start")) if extra else 1,
         depths=depths,
         seeds=_seeds(path, meta, extra, frame_count),
+        masks=masks,
+        matte=_matte(path, extra),
+        bounds=_bounds(path, extra),
         source=path,
     )
     capture.check_files()
@@ -196,22 +212,25 @@ def _entry(path: Path, meta: dict[str, Any], index: int, frame: Any, world: NDAr
         raise HoloreelError(f"{where}: {error}") from error
     own = frame.get("holoreel") or {}
     own = own if isinstance(own, dict) else {}
-    name, number, video_frame = own.get("camera"), own.get("frame"), own.get("video_frame")
-    file = _existing(path, frame["file_path"])
-    media: Media = file
-    if video_frame is not None:
-        media = VideoFrame(file, _integer(path, f"frames[{index}].holoreel.video_frame", video_frame))
-    depth = frame.get("depth_file_path")
+    name, number = own.get("camera"), own.get("frame")
+    depth, mask = frame.get("depth_file_path"), frame.get("mask_path")
     time = frame.get("time")
     return _Entry(
-        media=media,
+        media=_media(path, index, frame["file_path"], own, "video_frame"),
         listed=frame["file_path"],
         camera=camera,
         time=None if time is None else _number(path, f"frames[{index}].time", time),
         name=name if isinstance(name, str) else None,
         frame=None if number is None else _integer(path, f"frames[{index}].holoreel.frame", number),
         depth=_existing(path, depth) if isinstance(depth, str) else None,
+        mask=_media(path, index, mask, own, "mask_frame") if isinstance(mask, str) else None,
     )
+
+
+def _media(path: Path, index: int, name: str, own: dict[str, Any], key: str) -> Media:
+    """The picture `name` means, or the frame of a video, where the entry's own words (`own`) have its number."""
+    file, number = _existing(path, name), own.get(key)
+    return file if number is None else VideoFrame(file, _integer(path, f"frames[{index}].holoreel.{key}", number))
 
 
 def _distortion(where: str, meta: dict[str, Any], frame: dict[str, Any]) -> tuple[str, tuple[float, ...]]:
@@ -349,6 +368,27 @@ def _splits(path: Path, meta: dict[str, Any], entries: list[_Entry], names: list
         held_out.update(files)
     test = {name for entry, name in zip(entries, names, strict=True) if entry.listed in held_out}
     return {name: "test" if name in test else "train" for name in names}
+
+
+def _bounds(path: Path, extra: dict[str, Any] | None) -> tuple[Triple, Triple] | None:
+    value = (extra or {}).get("bounds")
+    if value is None:
+        return None
+    if not isinstance(value, list) or len(value) != 2:
+        raise HoloreelError(f"{path}: holoreel.bounds must be two corners of three numbers.")
+    return _triple(path, "holoreel.bounds[0]", value[0]), _triple(path, "holoreel.bounds[1]", value[1])
+
+
+def _matte(path: Path, extra: dict[str, Any] | None) -> Triple | None:
+    value = (extra or {}).get("matte")
+    return None if value is None else _triple(path, "holoreel.matte", value)
+
+
+def _triple(path: Path, field: str, value: Any) -> Triple:
+    if not isinstance(value, list) or len(value) != 3:
+        raise HoloreelError(f"{path}: {field} must be three finite numbers, not {str(value)[:60]}.")
+    x, y, z = (_number(path, field, part) for part in value)
+    return x, y, z
 
 
 def _seeds(path: Path, meta: dict[str, Any], extra: dict[str, Any] | None, frame_count: int) -> dict[int, Path]:
