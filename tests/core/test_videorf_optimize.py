@@ -1,0 +1,132 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The optimizer of tables against the losses by autograd and torch's own Adam, in float64."""
+
+import numpy as np
+import pytest
+import torch
+from holoreel.core.videorf.losses import spatial_loss, temporal_loss
+from holoreel.core.videorf.mapping import LAYOUTS, build_table
+from holoreel.core.videorf.optimize import (
+    BETAS,
+    EPSILON,
+    TableOptimizer,
+    image_neighbors,
+    lattice_neighbors,
+    noisy_rows,
+)
+
+STEP = torch.tensor([0.1, 0.02, 0.03, 0.04])
+RATES = torch.tensor([0.2, 0.05, 0.01, 0.03])
+
+
+def table_of(layout="blocks", shape=(20, 17, 19), share=0.4, seed=0):
+    occupancy = np.random.default_rng(seed).random(shape) < share
+    return build_table(occupancy, (64, 64), layout)
+
+
+def rows_of(mapping, seed=1):
+    generator = torch.Generator().manual_seed(seed)
+    return torch.randn(mapping.count + 1, 4, generator=generator) * STEP * 2
+
+
+@pytest.mark.parametrize("seam", [1.0, 0.25])
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_steps_are_those_of_adam_on_the_losses(layout, seam):
+    mapping = table_of(layout)
+    rows, previous = rows_of(mapping), rows_of(mapping, 2)[:-1]
+    low, high = torch.full((4,), -0.15), torch.full((4,), 0.2)
+    rows[:-1].clamp_(low, high)
+    valid = torch.from_numpy(mapping.valid())
+    columns = [rows[:-1, c : c + 1].double().requires_grad_() for c in range(4)]
+    adam = torch.optim.Adam(
+        [{"params": [column], "lr": float(rate)} for column, rate in zip(columns, RATES, strict=True)],
+        betas=BETAS,
+        eps=EPSILON,
+    )
+    mine = TableOptimizer(mapping, rows, STEP, low, high, previous)
+    last, pixels = rows[-1].clone(), torch.from_numpy(mapping.pixels).long()
+    generator = torch.Generator().manual_seed(3)
+    for _ in range(5):
+        gradient = torch.randn(rows.shape, generator=generator) * 1e-4
+        mine.step(gradient, RATES, 0.02, 0.03, seam)
+        exact = torch.cat(columns, 1)
+        image = exact.new_zeros(64 * 64, 4).index_put((pixels,), exact).reshape(64, 64, 4)
+        loss = 0.02 * spatial_loss(image, valid, STEP.double(), seam)
+        loss = loss + 0.03 * temporal_loss(exact, previous.double(), STEP.double())
+        loss = loss + (exact * gradient[:-1].double()).sum()
+        adam.zero_grad()
+        loss.backward()
+        adam.step()
+        with torch.no_grad():
+            for c, column in enumerate(columns):
+                column.clamp_(low[c].double(), high[c].double())
+    truth = torch.cat(columns, 1).detach()
+    assert ((truth == high) | (truth == low)).any()
+    assert torch.allclose(rows[:-1].double(), truth, rtol=0, atol=2e-5)
+    assert (rows[-1] == last).all()
+
+
+def test_first_frames_have_no_rows_before():
+    mapping = table_of()
+    rows = rows_of(mapping)
+    before = rows.clone()
+    wide = torch.full((4,), 9.0)
+    TableOptimizer(mapping, rows, STEP, -wide, wide).step(torch.zeros_like(rows), RATES, 0.0, 1.0)
+    assert (rows == before).all()
+
+
+def test_neighbors_are_mutual_and_next_to_each_other():
+    mapping = table_of("superblocks")
+    neighbors = image_neighbors(mapping)
+    row, column = np.divmod(mapping.pixels, 64)
+    offsets = [(-1, 0), (1, 0), (0, -1), (0, 1)]
+    for side, (down, right) in enumerate(offsets):
+        has = neighbors.rows[:, side] >= 0
+        other = neighbors.rows[has, side]
+        assert (row[other] - row[has] == down).all()
+        assert (column[other] - column[has] == right).all()
+        assert (neighbors.rows[other, side ^ 1] == np.flatnonzero(has)).all()
+        apart = (row[other] // 8 != row[has] // 8) | (column[other] // 8 != column[has] // 8)
+        assert (neighbors.seam[has, side] == apart).all()
+        assert not neighbors.seam[~has, side].any()
+    assert (neighbors.rows >= 0).sum() > 3 * mapping.count
+
+
+def test_neighbors_in_space():
+    mapping = table_of(share=0.6)
+    found = lattice_neighbors(mapping.lookup()).rows
+    place = mapping.vertices.astype(int)
+    lookup = mapping.lookup()
+    for side in range(6):
+        offset = np.zeros(3, int)
+        offset[side // 2] = (-1, 1)[side % 2]
+        there = place + offset
+        inside = ((there >= 0) & (there < lookup.shape)).all(1)
+        assert (found[~inside, side] == -1).all()
+        assert (found[inside, side] == lookup[tuple(there[inside].T)]).all()
+
+
+def test_noise_is_uniform_and_hangs_on_the_seed_alone():
+    rows, step = torch.zeros(50_001, 4), STEP
+    first, again, other = noisy_rows(rows, step, 7), noisy_rows(rows, step, 7), noisy_rows(rows, step, 8)
+    assert (first == again).all()
+    assert (first != other)[:-1].float().mean() > 0.99
+    assert (first[-1] == 0).all()
+    share = first[:-1] / step
+    assert share.abs().max() <= 0.5
+    assert torch.allclose(share.mean(0), torch.zeros(4), atol=0.01)
+    assert torch.allclose(share.var(0), torch.full((4,), 1 / 12), atol=0.002)
+    assert abs(np.corrcoef(share.numpy().T) - np.eye(4)).max() < 0.02  # channels know nothing of each other
+    assert abs(np.corrcoef(share[1:, 0].numpy(), share[:-1, 0].numpy())[0, 1]) < 0.02  # nor do rows
+    out = torch.empty_like(rows)
+    assert noisy_rows(rows + 1, step, 7, out) is out
+    assert torch.allclose(out - 1, first, atol=1e-6)
+
+
+def test_what_does_not_fit_is_refused():
+    mapping = table_of()
+    rows, wide = rows_of(mapping), torch.full((4,), 9.0)
+    with pytest.raises(ValueError, match="the rows are"):
+        TableOptimizer(mapping, rows[:-1], STEP, -wide, wide)
+    with pytest.raises(ValueError, match="the rows before"):
+        TableOptimizer(mapping, rows, STEP, -wide, wide, rows)
