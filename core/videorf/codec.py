@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from ..errors import HoloreelError
 from ..files import atomic_path
-from .mp4 import Span, fragments
+from .mp4 import Span, boxes, fragments
 
 RUNGS = (16, 20, 24, 28, 32, 36)  # QP
 NEUTRAL = 128
@@ -31,11 +31,12 @@ FULL_RANGE = 2  # AVCOL_RANGE_JPEG
 
 
 class Codec(NamedTuple):
-    """An encoder of FFmpeg and its options; `{qp}` in them stands for the rung."""
+    """An encoder of FFmpeg and its options, where `{qp}` stands for the rung; the tag in the file, the largest QP."""
 
     encoder: str
     options: dict[str, str]
     tag: str
+    qp_max: int
 
 
 CODECS = {
@@ -43,8 +44,9 @@ CODECS = {
         "libx264",
         {"preset": "medium", "qp": "{qp}", "tune": "psnr", "aq-mode": "0", "forced-idr": "1", "x264-params": _H264},
         "avc1",
+        51,
     ),
-    "hevc": Codec("libx265", {"preset": "medium", "forced-idr": "1", "x265-params": _HEVC + ":qp={qp}"}, "hvc1"),
+    "hevc": Codec("libx265", {"preset": "medium", "forced-idr": "1", "x265-params": _HEVC + ":qp={qp}"}, "hvc1", 51),
 }
 
 
@@ -72,6 +74,35 @@ class CodedVideo(NamedTuple):
     groups: tuple[CodedGroup, ...]
 
 
+def check_rung(qp: int, codec: str) -> None:
+    """Raise `HoloreelError` where a codec is unknown or has no such QP, or this machine has no encoder for it."""
+    import av
+
+    if codec not in CODECS:
+        raise HoloreelError(f"The codec '{codec}' is unknown: take one of {', '.join(CODECS)}.")
+    if not 0 <= qp <= CODECS[codec].qp_max:
+        raise HoloreelError(f"A QP of {qp} is out of range: take 0 to {CODECS[codec].qp_max} for {codec}.")
+    encoder = CODECS[codec].encoder
+    try:
+        av.codec.Codec(encoder, "w")
+    except av.codec.codec.UnknownCodecError as error:
+        raise HoloreelError(
+            f"PyAV has no {encoder} here, so no {codec} can be encoded: take another codec, or the PyAV of PyPI."
+        ) from error
+
+
+def code_lumas(lumas: Sequence[NDArray[np.uint8]], qp: int, codec: str = "h264") -> tuple[list[NDArray[np.uint8]], int]:
+    """Encode the lumas (H, W) of one group in memory; return them decoded, and the bytes of the fragment."""
+    check_rung(qp, codec)
+    if not lumas:
+        raise ValueError("a group has at least one frame")
+    file = io.BytesIO()
+    _write(file, lumas, {0}, 30.0, qp, CODECS[codec])
+    data = file.getvalue()
+    head = next(span.offset for kind, span in boxes(file, len(data)) if kind == b"moof")
+    return list(_decode(data, lumas[0].shape)), len(data) - head
+
+
 def encode_video(
     path: Path, lumas: Iterable[NDArray[np.uint8]], counts: Sequence[int], *, fps: float, qp: int, codec: str = "h264"
 ) -> CodedVideo:
@@ -79,10 +110,7 @@ def encode_video(
 
     Raises `HoloreelError` for an unknown codec, a QP out of range, or more or fewer lumas than the groups have.
     """
-    if codec not in CODECS:
-        raise HoloreelError(f"The codec '{codec}' is unknown: take one of {', '.join(CODECS)}.")
-    if not 0 <= qp <= 51:
-        raise HoloreelError(f"A QP of {qp} is out of range: take 0 to 51.")
+    check_rung(qp, codec)
     if not counts or min(counts) < 1:
         raise ValueError("every group has at least one frame")
     firsts = np.concatenate(([0], np.cumsum(counts)[:-1])).tolist()
@@ -102,7 +130,14 @@ def encode_video(
     return CodedVideo(len(data), head, tuple(groups))
 
 
-def _write(path: Path, lumas: Iterable[NDArray[np.uint8]], heads: set[int], fps: float, qp: int, codec: Codec) -> int:
+def _write(
+    file: Path | io.BytesIO,
+    lumas: Iterable[NDArray[np.uint8]],
+    heads: set[int],
+    fps: float,
+    qp: int,
+    codec: Codec,
+) -> int:
     import av
 
     rate = Fraction(fps).limit_denominator(1001)
@@ -110,7 +145,8 @@ def _write(path: Path, lumas: Iterable[NDArray[np.uint8]], heads: set[int], fps:
     # Frame by frame into the file: `frag_keyframe` cuts a fragment before every key frame, and only heads are key
     # frames.
     flags = {"movflags": "frag_keyframe+empty_moov+default_base_moof+skip_trailer"}
-    with av.open(str(path), "w", format="mp4", container_options=flags) as container:
+    target = str(file) if isinstance(file, Path) else file
+    with av.open(target, "w", format="mp4", container_options=flags) as container:
         stream: Any = None
         index = -1
         for index, luma in enumerate(lumas):

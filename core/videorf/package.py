@@ -138,16 +138,6 @@ class VideoReel:
         """Read the shading network."""
         return read_shading(self.path.parent / self.shading_file, self.shading)
 
-    def sizes(self, rung: int = 0) -> dict[str, int]:
-        """Return what a player fetches for a rung, in bytes: manifest, video, tables, shading, and their total."""
-        parts = {
-            "manifest": self.path.stat().st_size,
-            "video": self.rungs[rung].video.size,
-            "tables": sum(group.size for group in self.groups),
-            "shading": 4 * self.shading.count,
-        }
-        return parts | {"total": sum(parts.values())}
-
 
 def write_tables(path: str | Path, tables: Sequence[MappingTable], frames: Sequence[int]) -> tuple[TableEntry, ...]:
     """Write the bitmasks of groups of so many frames to one file, atomically; returns where they lie."""
