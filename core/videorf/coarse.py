@@ -1,21 +1,37 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """The coarse field of one frame: a dense grid of raw density and color (Sec. 4.1)."""
 
+import math
 import zipfile
 import zlib
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+import torch
 from numpy.lib import format as npy
 from numpy.typing import NDArray
+from torch import Tensor
 
 from ..errors import HoloreelError
 from ..files import atomic_path
+from . import morton
+from .field import FieldLattice, MarchRules, Rays
+from .hull import REACH, visual_hull
+from .losses import rgb_loss
+from .march import Volume, march
 from .occupancy import GAMMA, WEIGHT_SHARE, Lattice, Occupancy, occupied
+from .optimize import TableOptimizer, lattice_neighbors
 from .quantize import EMPTY_DENSITY
+from .views import FrameViews
 
 UNKNOWN_COLOR = 0.5  # of vertices that were not trained
+START_DENSITY = 0.0  # the hull is half-solid at first
+REPORT_EVERY = 20  # steps
+LOWEST, HIGHEST = -12.0, 16.0  # raw densities stay between
+SMOOTH_STEPS = (1.0, 0.1, 0.1, 0.1)  # differences of density and color that total variation takes for large
 
 Grid = NDArray[np.float32]
 
@@ -127,3 +143,139 @@ def _header(archive: zipfile.ZipFile, name: str) -> tuple[tuple[int, ...], np.dt
 def _array(archive: zipfile.ZipFile, name: str) -> NDArray:
     with archive.open(f"{name}.npy") as file:
         return np.asarray(npy.read_array(file, allow_pickle=False))
+
+
+@dataclass(frozen=True)
+class CoarseConfig:
+    """How a coarse field is trained."""
+
+    iterations: int = 300
+    """steps"""
+    rays: int = 4096
+    """pixels that a step looks at"""
+    density_rate: float = 0.35
+    """Adam's step for raw densities"""
+    color_rate: float = 0.08
+    """Adam's step for colors"""
+    final_rate: float = 0.1
+    """both rates decay to this part of themselves"""
+    entropy: float = 0.01
+    """weight of the background's entropy: rays shall be either stopped or free"""
+    smooth: float = 0.0
+    """weight of the total variation in space"""
+    misses: int = 0
+    """masks that may leave out a vertex of the visual hull"""
+    reach: float = REACH
+    """spacings from a mask at which a vertex is still in the hull"""
+    step: float = 0.5
+    """of the ray march, in spacings"""
+    weight_rays: int = 65536
+    """rays, at most, by which vertices are weighed"""
+
+
+Listener = Callable[[int, float], None]
+
+
+def train_coarse(
+    views: FrameViews,
+    lattice: Lattice,
+    config: CoarseConfig | None = None,
+    seed: int = 0,
+    on_progress: Listener | None = None,
+) -> Coarse:
+    """Return the density and color of one frame, optimized in the vertices of its visual hull.
+
+    The loss is that of the rays' colors over a random background each, so that what is empty must let it through, plus
+    the entropy of what a ray lets through (DVGO). `on_progress` hears of the steps done and the batch's PSNR. The
+    result hangs on the seed, not on the number of threads. Raises `HoloreelError` where the hull is empty.
+    """
+    config = config or CoarseConfig()
+    hull = visual_hull(views, lattice, config.misses, config.reach)
+    vertices = np.argwhere(hull)
+    vertices = vertices[np.argsort(morton.encode(*vertices.T))]
+    lookup = np.full(lattice.shape, -1, np.int32)
+    lookup[tuple(vertices.T)] = np.arange(len(vertices))
+    volume = Volume(FieldLattice(lattice, lookup, len(vertices) + 1))
+    with one_torch_thread():
+        rows = _optimized(volume, views, config, seed, on_progress)
+        weights = ray_weights(volume, rows, views, config, seed)
+    return Coarse(
+        lattice,
+        _scattered(rows[:-1, 0], vertices, lattice, EMPTY_DENSITY),
+        _scattered(rows[:-1, 1:], vertices, lattice, UNKNOWN_COLOR),
+        _scattered(weights, vertices, lattice, 0.0),
+    )
+
+
+@contextmanager
+def one_torch_thread() -> Iterator[None]:
+    """Keep torch to one thread: its idle ones would spin on the cores of the march."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)
+
+
+def _optimized(
+    volume: Volume, views: FrameViews, config: CoarseConfig, seed: int, on_progress: Listener | None
+) -> Tensor:
+    """Return the rows (N + 1, 4) [raw density, color]: color is what the march sums, without any activation."""
+    rows = torch.tensor([START_DENSITY, *[UNKNOWN_COLOR] * 3]).repeat(volume.field.rows, 1)
+    rows[-1] = torch.tensor([EMPTY_DENSITY, 0.0, 0.0, 0.0])
+    low, high = torch.tensor([LOWEST, 0.0, 0.0, 0.0]), torch.tensor([HIGHEST, 1.0, 1.0, 1.0])
+    neighbors = lattice_neighbors(volume.field.lookup)
+    optimizer = TableOptimizer(neighbors, rows, torch.tensor(SMOOTH_STEPS), low, high)
+    rates = torch.tensor([config.density_rate, *[config.color_rate] * 3])
+    generator = torch.Generator().manual_seed(seed)
+    for iteration in range(config.iterations):
+        leaf = rows.detach().requires_grad_()
+        photometric, unsure = _losses(volume, leaf, views, config, generator)
+        (gradient,) = torch.autograd.grad(photometric + config.entropy * unsure, leaf)
+        optimizer.step(gradient, rates * config.final_rate ** (iteration / config.iterations), spatial=config.smooth)
+        if on_progress and ((iteration + 1) % REPORT_EVERY == 0 or iteration + 1 == config.iterations):
+            on_progress(iteration + 1, -10 * math.log10(max(float(photometric) / 3, 1e-10)))
+    return rows
+
+
+def _losses(
+    volume: Volume, rows: Tensor, views: FrameViews, config: CoarseConfig, generator: torch.Generator
+) -> tuple[Tensor, Tensor]:
+    """Return L_rgb of a batch and the mean entropy of its background."""
+    batch = views.sample(config.rays, generator)
+    jitter = torch.rand(config.rays, generator=generator)
+    background = torch.rand(config.rays, 3, generator=generator)
+    marched = march(volume, rows, Rays(batch.origins, batch.directions, jitter), MarchRules(config.step))
+    alpha = batch.rgba[:, 3:]
+    truth = batch.rgba[:, :3] * alpha + background * (1 - alpha)
+    left = marched.transmittance
+    return rgb_loss(marched.features + left[:, None] * background, truth), entropy(left).mean()
+
+
+def entropy(transmittance: Tensor) -> Tensor:
+    """Return the entropy of whether a ray reaches the background, in nats: 0 where it surely does or does not."""
+    left = transmittance.clamp(1e-6, 1 - 1e-6)
+    return -(left * left.log() + (1 - left) * (1 - left).log())
+
+
+def ray_weights(volume: Volume, rows: Tensor, views: FrameViews, config: CoarseConfig, seed: int) -> Tensor:
+    """Return what rays of the pool see of each row (N): the sum of their samples' weights, shared out to corners.
+
+    That is the gradient of the sum of a summed feature. A large pool is thinned at random.
+    """
+    generator = torch.Generator().manual_seed(seed)
+    chosen = torch.arange(len(views))
+    if len(views) > config.weight_rays:
+        chosen = torch.randperm(len(views), generator=generator)[: config.weight_rays]
+    batch = views.rays(chosen)
+    leaf = torch.cat((rows[:, :1], torch.zeros_like(rows[:, :1])), 1).requires_grad_()
+    marched = march(volume, leaf, Rays(batch.origins, batch.directions), MarchRules(config.step))
+    (gradient,) = torch.autograd.grad(marched.features.sum(), leaf)
+    return gradient[:-1, 1]
+
+
+def _scattered(values: Tensor, vertices: NDArray[np.int64], lattice: Lattice, fill: float) -> Grid:
+    grid = np.full((*lattice.shape, *values.shape[1:]), fill, np.float32)
+    grid[tuple(vertices.T)] = values.numpy()
+    return grid
