@@ -9,6 +9,7 @@ it is needed.
 
 import hashlib
 import io
+import os
 import zlib
 from collections.abc import Iterable, Iterator, Sequence
 from fractions import Fraction
@@ -27,6 +28,7 @@ NEUTRAL = 128
 THREADS = "4"  # x264 decides by it where motion may point: fixed, so that every machine writes the same file
 _H264 = "keyint=infinite:scenecut=0:open-gop=0:ref=3:bframes=0:fullrange=on"
 _HEVC = "keyint=-1:scenecut=0:open-gop=0:bframes=0:range=full:aq-mode=0:log-level=error"
+_AV1 = "rc=0:keyint=-1:scd=0:pred-struct=1:aq-mode=0:color-range=1:lp=2"
 FULL_RANGE = 2  # AVCOL_RANGE_JPEG
 
 
@@ -47,6 +49,7 @@ CODECS = {
         51,
     ),
     "hevc": Codec("libx265", {"preset": "medium", "forced-idr": "1", "x265-params": _HEVC + ":qp={qp}"}, "hvc1", 51),
+    "av1": Codec("libsvtav1", {"preset": "6", "svtav1-params": _AV1 + ":qp={qp}"}, "av01", 63),
 }
 
 
@@ -140,6 +143,7 @@ def _write(
 ) -> int:
     import av
 
+    os.environ.setdefault("SVT_LOG", "1")  # SVT-AV1 has no other way to be told to report errors alone
     rate = Fraction(fps).limit_denominator(1001)
     options = {name: value.format(qp=qp) for name, value in codec.options.items()} | {"threads": THREADS}
     # Frame by frame into the file: `frag_keyframe` cuts a fragment before every key frame, and only heads are key
