@@ -122,12 +122,14 @@ def ablate(
 
 
 def fingerprint(capture: Capture) -> str:
-    """Return a digest of what a run depends on: cameras, splits, and the pictures' and seeds' sizes and times."""
+    """Return a digest of what a run depends on: cameras, splits, bounds, and the sizes and times of pictures, masks and
+    seeds."""
     text = [repr((name, camera.to_json(), capture.split(name))) for name, camera in capture.cameras.items()]
-    pictures = (media.path if isinstance(media, VideoFrame) else media for media in capture.images.values())
+    every = (*capture.images.values(), *capture.masks.values())
+    pictures = (media.path if isinstance(media, VideoFrame) else media for media in every)
     files = sorted({*pictures, *capture.seeds.values()})
     text += [f"{path.name} {(state := path.stat()).st_size} {state.st_mtime_ns}" for path in files]
-    return hashlib.sha256("\n".join([str(capture.frame_count), *text]).encode()).hexdigest()
+    return hashlib.sha256("\n".join([str(capture.frame_count), str(capture.bounds), *text]).encode()).hexdigest()
 
 
 def _row(
@@ -141,7 +143,7 @@ def _row(
     on_progress: Callable[[Part, int, int], None] | None,
 ) -> Finished:
     record_path = folder / "row.json"
-    made_of = {"config": _plain(asdict(config)), "capture": digest}
+    made_of = {"config": plain(asdict(config)), "capture": digest}
     record = read_json(record_path) if record_path.is_file() else {}
     reel = folder / "model.reel"
     if {key: record.get(key) for key in made_of} != made_of:
@@ -170,11 +172,11 @@ def _measure(reel: Path, capture: Capture, folder: Path, record: dict[str, Any],
     write_json(folder / "row.json", record)
 
 
-def _plain(value: Any) -> Any:
+def plain(value: Any) -> Any:
     """Return a configuration as JSON gives it back."""
     if isinstance(value, dict):
-        return {key: _plain(part) for key, part in value.items()}
-    return [_plain(part) for part in value] if isinstance(value, tuple | list) else value
+        return {key: plain(part) for key, part in value.items()}
+    return [plain(part) for part in value] if isinstance(value, tuple | list) else value
 
 
 def columns(rows: dict[str, Finished]) -> list[str]:
@@ -219,7 +221,7 @@ def write_results(
     write_json(
         out / "ablation.json",
         {
-            "config": _plain(asdict(config)),
+            "config": plain(asdict(config)),
             "scenes": {
                 name: {
                     key: {**row.mean, "gaussians": row.gaussians, "seconds": row.seconds} for key, row in rows.items()
@@ -231,7 +233,9 @@ def write_results(
     sections = []
     for name, rows in results.items():
         lines = table(rows)
-        crops = write_crops(out / name, read_capture(scenes[name]), rows)
+        capture = read_capture(scenes[name])
+        truth = capture.image(*shown_view(capture), background=(0.0, 0.0, 0.0))
+        crops = write_crops(out / name, capture, {key: row.part.title for key, row in rows.items()}, truth)
         sections.append(Section(name, rows=(crops,), table=Table(lines[0], tuple(lines[1:]))))
     intro = (
         f"Each row was trained without one part of the method, for {config.iterations} iterations like the full one, "
@@ -242,18 +246,24 @@ def write_results(
     return page
 
 
-def write_crops(folder: Path, capture: Capture, rows: dict[str, Finished]) -> Row:
-    """Write the crops of one scene to FOLDER/crops and return them as a row of the page, the truth first."""
-    name = capture.camera_names("test")[0]
-    index = capture.frame_count // 2
+def shown_view(capture: Capture) -> tuple[str, int]:
+    """Return the view that pages show: the first camera held out, and the middle frame counted from 0."""
+    return capture.camera_names("test")[0], capture.frame_count // 2
+
+
+def write_crops(folder: Path, capture: Capture, titles: dict[str, str], truth: NDArray[np.uint8]) -> Row:
+    """Write crops of the pictures in FOLDER/KEY to FOLDER/crops and return them as a row of the page, the truth first.
+
+    They are of `shown_view`, of which `truth` (H, W, 3) is the picture. `titles` has the keys, and what is said below.
+    """
+    name, index = shown_view(capture)
     drawn = {
-        row.part.title: read_image(picture_path(folder / key, name, capture.frame_start + index))[..., :3]
-        for key, row in rows.items()
+        title: read_image(picture_path(folder / key, name, capture.frame_start + index))[..., :3]
+        for key, title in titles.items()
     }
-    truth = capture.image(name, index, background=(0.0, 0.0, 0.0)).astype(np.float32) / 255.0
-    corner, side = worst_place([np.square(image - truth).sum(axis=2) for image in drawn.values()])
+    corner, side = worst_place([np.square(image - truth / 255.0).sum(axis=2) for image in drawn.values()])
     pictures = []
-    for number, (title, image) in enumerate({"Truth": truth, **drawn}.items()):
+    for number, (title, image) in enumerate({"Truth": truth.astype(np.float32) / 255.0, **drawn}.items()):
         crop = image[corner[0] : corner[0] + side, corner[1] : corner[1] + side]
         file = folder / "crops" / f"{number}.png"
         write_png(file, crop.repeat(3, axis=0).repeat(3, axis=1))
