@@ -16,6 +16,7 @@ from ..capture import Capture
 from ..errors import HoloreelError
 from ..files import atomic_path, write_json
 from ..reel import Reel, SegmentPayload, write_segments
+from ..runs import claim_run, differences
 from .config import TrainConfig
 from .decoder import Decoder
 from .model import ROWS, SpacetimeGaussians
@@ -81,16 +82,8 @@ def train_reel(
     run goes on from there. `on_progress` hears of all segments as one long run.
     Raises `HoloreelError` if `out` cannot be written or the checkpoint belongs to other settings.
     """
-    if out.suffix != ".reel":
-        raise HoloreelError(f"{out}: a reel's name ends in .reel; pass --out {out}.reel.")
     paths = RunPaths(out)
-    _claim_folder(out.parent)
-    if paths.checkpoint.exists() and not resume:
-        raise HoloreelError(
-            f"{paths.checkpoint}: a stopped run lies here; pass --resume to go on, or delete it to start anew."
-        )
-    if resume and not paths.checkpoint.exists():
-        raise HoloreelError(f"{paths.checkpoint}: no checkpoint to resume from; leave --resume away to start anew.")
+    claim_run(out, paths.checkpoint, resume)
     plans = plan_segments(capture.frame_count, config.segment, config.overlap)
     finished: list[_Finished] = []
     for plan in plans:
@@ -165,17 +158,6 @@ def _finish(trainer: Trainer, plan: SegmentPlan, capture: Capture) -> _Finished:
     return _Finished(payload, inherited(gaussians, trainer.scene.footprint, trainer.config), record)
 
 
-def _claim_folder(folder: Path) -> None:
-    """Make sure that the result can be written before hours are spent on it."""
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        probe = folder / ".holoreel-write-test"
-        probe.touch()
-        probe.unlink()
-    except OSError as error:
-        raise HoloreelError(f"{folder}: cannot write here ({error.strerror}); choose another --out.") from error
-
-
 def save_checkpoint(trainer: Trainer, plan: SegmentPlan, path: Path) -> None:
     """Write the trainer's state; an older checkpoint stays whole until the new one is."""
     path.parent.mkdir(exist_ok=True)
@@ -233,7 +215,7 @@ def _load(path: Path, config: TrainConfig) -> dict[str, Any]:
         state = torch.load(path, weights_only=True)
     except Exception as error:  # the unpickler raises what it likes
         raise HoloreelError(f"{path}: not a readable checkpoint; delete {path.parent} and train anew.") from error
-    changed = _differences(state.get("config", {}), asdict(config))
+    changed = differences(state.get("config", {}), asdict(config), ("checkpoint_every",))
     if changed:
         raise HoloreelError(f"{path}: was written with another {', '.join(changed)}; pass the same settings to resume.")
     return state
@@ -245,22 +227,6 @@ def _tensors(gaussians: SpacetimeGaussians) -> dict[str, torch.Tensor]:
 
 def _gaussians(tensors: Mapping[str, torch.Tensor]) -> SpacetimeGaussians:
     return SpacetimeGaussians(**{name: tensors[name].numpy() for name in ROWS})
-
-
-def _differences(old: Mapping, new: Mapping, prefix: str = "") -> list[str]:
-    """Name the settings that two (nested) configurations do not share."""
-    names = []
-    for key in sorted(old.keys() | new.keys()):
-        a, b = old.get(key), new.get(key)
-        if isinstance(a, Mapping) and isinstance(b, Mapping):
-            names += _differences(a, b, f"{prefix}{key}.")
-        elif _plain(a) != _plain(b) and key != "checkpoint_every":
-            names.append(f"{prefix}{key}")
-    return names
-
-
-def _plain(value: object) -> object:
-    return list(value) if isinstance(value, tuple | list) else value
 
 
 def _write_result(capture: Capture, config: TrainConfig, finished: list[_Finished], paths: RunPaths) -> Reel:

@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Training settings: the fields are the flags of `holoreel train videorf`, and a run writes them beside its result."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 from ..errors import HoloreelError
+from .coarse import CoarseConfig
 from .grouping import LONGEST
 from .mapping import Layout
 from .occupancy import GAMMA, WEIGHT_SHARE
@@ -30,8 +31,6 @@ class VideoConfig:
     """a vertex counts where its opacity over one spacing exceeds this (Sec. 4.1)"""
     weight_share: float = WEIGHT_SHARE
     """and where it is among the heaviest vertices that hold this part of all that rays see"""
-    misses: int = 0
-    """a vertex counts though so many masks leave it out"""
     border: int = 5
     """pixels around a mask whose rays are looked at, too"""
     image: int = 0
@@ -102,6 +101,8 @@ class VideoConfig:
     """codecs of the rungs that are written"""
     seed: int = 0
     """of the run's random numbers"""
+    coarse: CoarseConfig = field(default_factory=CoarseConfig)
+    """the coarse fields"""
 
     def __post_init__(self) -> None:
         counts = ("rays", "first_iterations", "head_iterations", "iterations", "longest", "shading_groups")
@@ -143,7 +144,14 @@ class VideoConfig:
 # `fast` is for a first look; `paper` is the published method with nothing added: plain warm starts, plain losses.
 PRESETS = {
     "standard": VideoConfig(),
-    "fast": VideoConfig(resolution=64, first_iterations=400, head_iterations=300, iterations=150, rays=3072),
+    "fast": VideoConfig(
+        resolution=64,
+        first_iterations=400,
+        head_iterations=300,
+        iterations=150,
+        rays=3072,
+        coarse=CoarseConfig(iterations=150),
+    ),
     "paper": VideoConfig(start="warm", features=11, frequencies=4, resolution=128, rays=8192),
 }
 
