@@ -1,27 +1,22 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Draw a reel, PLY or .splatv as a camera sees it at a frame: from a file to a picture in numpy."""
+"""From a file to a picture in numpy: what every kind of player gives, and the player that a file needs."""
 
-from functools import lru_cache
+from abc import ABC, abstractmethod
 from pathlib import Path
-from types import ModuleType
-from typing import NamedTuple
+from typing import Any, ClassVar, Literal, NamedTuple
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from .camera import Camera
 from .capture import Capture
 from .errors import HoloreelError
 from .gaussians.decoder import Activation
-from .gaussians.model import SpacetimeGaussians
-from .reel import Loaded, Triple, load_gaussians
-from .render import Backend, get_backend
-from .render.contract import Rules, SpacetimeTensors
-from .render.lifetimes import Lifetimes
-from .render.view import DecoderTensors, decoder_tensors, render_view
+from .reel import VIDEORF, Triple, reel_kind
+from .render import Backend
+from .videorf.model import HEADER as MODEL_HEADER
 
-SEGMENTS_HELD = 2  # in memory at a time: going back and forth over a seam reads nothing twice
+Quality = Literal["full", "fast", "draft"]  # of a VideoRF's drawings: how long the steps of a march are
 
 
 class Drawing(NamedTuple):
@@ -35,51 +30,22 @@ class Drawing(NamedTuple):
     depth: NDArray[np.float32]
 
 
-def draw(
-    gaussians: SpacetimeTensors,
-    time: float,
-    camera: Camera,
-    backend: ModuleType,
-    background: Triple = (0.0, 0.0, 0.0),
-    decoder: DecoderTensors | None = None,
-    rules: Rules | None = None,
-    rows: torch.Tensor | None = None,
-) -> Drawing:
-    """Draw Gaussians at a normalized time through any lens; `backend` as `core.render.get_backend` returns it.
+class Player(ABC):
+    """Draws the frames of one file, with little of it in memory at a time.
 
-    With a `decoder`, `background` is ignored: it colors every pixel. `rows` are those that are drawn, all if None.
-    """
-    with torch.no_grad():
-        color = torch.tensor(background, device=backend.DEVICE)
-        rendering = render_view(backend, gaussians, time, camera, color, decoder, rules, rows=rows)
-    return Drawing(*(part.cpu().numpy() for part in rendering))
-
-
-def to_tensors(gaussians: SpacetimeGaussians, decoded: bool = False) -> SpacetimeTensors:
-    """Return the parameters as tensors that can be drawn: of a full model, all features if they shall be `decoded`,
-    else the base color alone."""
-    arrays = {name: getattr(gaussians, name) for name in SpacetimeTensors._fields}
-    if not decoded:
-        arrays["features"] = np.ascontiguousarray(arrays["features"][:, :3])
-    return SpacetimeTensors(**{name: torch.from_numpy(array) for name, array in arrays.items()})
-
-
-class Player:
-    """Draws the frames of one file, lite or full, with few of its segments in memory at a time.
-
-    Frames are those of the timeline, sub-frames allowed: `frame_start` to `frame_start + frame_count - 1`.
-    `decoder_output` is as in `core.reel.load_gaussians`.
+    Frames are those of the timeline: `frame_start` to `frame_start + frame_count - 1`. `backend_name` says what draws,
+    `report` in sentences what was assumed and what is unusual.
     """
 
-    def __init__(self, path: str | Path, backend: Backend = "auto", decoder_output: Activation | None = None):
-        self.path = Path(path)
-        self.backend = get_backend(backend)
-        self.first: Loaded = load_gaussians(self.path, decoder_output=decoder_output)
-        self.report = self.first.report
-        whole = self.first.reel or self.first
-        self.frame_start, self.frame_count = whole.frame_start, whole.frame_count
-        self.rules = Rules(near=self.first.reel.near) if self.first.reel else Rules()
-        self._segment = lru_cache(maxsize=SEGMENTS_HELD)(self._load)
+    path: Path
+    backend_name: str
+    report: list[str]
+    frame_start: int
+    frame_count: int
+    background: Triple  # what pictures lie over unless another color is asked for
+    takes_background: bool = True  # whether another color may be asked for
+    numbered: bool = True  # whether the file knows its frames' numbers
+    subject_alone: ClassVar[bool] = False  # whether it shows a subject cut out of its surroundings
 
     def frame_at(self, time: float) -> float:
         """Return the frame at a normalized time of the whole file: 0 is the first one, 1 is just after the last."""
@@ -88,10 +54,10 @@ class Player:
     def frames_of(self, capture: Capture) -> list[float]:
         """Return the frame to draw for each frame of a capture.
 
-        A reel is matched by frame number; a bare PLY or .splatv, which knows no numbers, by normalized time. Raises
+        A reel is matched by frame number; a bare file, which knows no numbers, by normalized time. Raises
         `HoloreelError` where the reel does not cover the capture: it was made from another one.
         """
-        if self.first.reel is None:
+        if not self.numbered:
             return [self.frame_at(time) for time in capture.times]
         first, last = self.frame_start, self.frame_start + self.frame_count - 1
         start, end = capture.frame_start, capture.frame_start + capture.frame_count - 1
@@ -102,32 +68,58 @@ class Player:
             )
         return [float(frame) for frame in range(start, end + 1)]
 
-    def draw(
-        self,
-        camera: Camera,
-        frame: float,
-        background: Triple | None = None,
-        rules: Rules | None = None,
-        listed: bool = True,
-    ) -> Drawing:
-        """Draw one frame, over the reel's own background unless another is given; a full model has none.
+    def missing(self) -> range | list[int]:
+        """Return the frames of the timeline that cannot be drawn, because a file was cut off."""
+        return []
 
-        `listed` draws only the rows that are alive at the frame: the same picture, sooner.
-        """
-        reel = self.first.reel
-        segment, time = reel.locate(frame) if reel else (0, self.first.time_of(frame))
-        gaussians, decoder, lifetimes = self._segment(segment)
-        color = self.first.background if background is None else background
-        rules = rules or self.rules
-        # The lists hold for the usual threshold of visibility, and where what has faded shall be left out.
-        known = listed and rules.cull_faded and rules.alpha_min == lifetimes.alpha_min
-        rows = lifetimes.rows(time) if known else None
-        return draw(gaussians, time, camera, self.backend, color, decoder, rules, rows)
+    @abstractmethod
+    def draw(self, camera: Camera, frame: float, background: Triple | None = None) -> Drawing:
+        """Draw one frame through any lens, over the file's own background unless another is given."""
 
-    def _load(self, segment: int) -> tuple[SpacetimeTensors, DecoderTensors | None, Lifetimes]:
-        loaded = self.first if segment == 0 else load_gaussians(self.path, segment)
-        decoder = decoder_tensors(loaded.decoder) if loaded.decoder else None
-        tensors = to_tensors(loaded.gaussians, decoded=decoder is not None)
-        frames = loaded.reel.segments[segment].frame_count if loaded.reel else loaded.frame_count
-        lifetimes = Lifetimes(tensors, frames, Rules().alpha_min)
-        return SpacetimeTensors(*(tensor.to(self.backend.DEVICE) for tensor in tensors)), decoder, lifetimes
+    @abstractmethod
+    def reach(self, camera: Camera) -> NDArray[np.bool_] | None:
+        """Return the pixels (H, W) that a drawing of this camera can reach; None where it reaches all."""
+
+    @abstractmethod
+    def size(self) -> int:
+        """Return the bytes on disk of everything that is needed to play the file."""
+
+    @abstractmethod
+    def facts(self) -> dict[str, Any]:
+        """Return what `metrics.json` says of the model."""
+
+
+def open_player(
+    path: str | Path,
+    backend: Backend = "auto",
+    *,
+    decoder_output: Activation | None = None,
+    rung: str | None = None,
+    quality: Quality | None = None,
+) -> Player:
+    """Open the player that a file needs: of Gaussians (`.reel`, `.ply`, `.stgc`, `.splatv`), of a VideoRF (`.reel`), or
+    of the folder of a trained VideoRF that was not coded yet.
+
+    `decoder_output` is as in `core.reel.load_gaussians`; `rung` and `quality` are as in `videorf.player.VideoPlayer`.
+    Raises `HoloreelError` where one is given that the file has no use for.
+    """
+
+    def refuse(**choices: str | None) -> None:
+        for name, value in choices.items():
+            if value is not None:
+                raise HoloreelError(f"{path} has no use for --{name.replace('_', '-')}: leave it away.")
+
+    if reel_kind(path) == VIDEORF:
+        from .videorf.player import VideoPlayer
+
+        refuse(decoder_output=decoder_output)
+        return VideoPlayer(path, rung, quality or "full", backend)
+    if (Path(path) / MODEL_HEADER).is_file():
+        from .videorf.player import FieldPlayer
+
+        refuse(decoder_output=decoder_output, rung=rung)
+        return FieldPlayer.open(path, quality or "full", backend)
+    from .gaussians.player import GaussianPlayer
+
+    refuse(rung=rung, quality=quality)
+    return GaussianPlayer(path, backend, decoder_output)

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Measure a reel against the pictures of a capture that it was not trained on."""
 
+import math
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -8,17 +9,22 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from .camera import Camera
 from .capture import Capture
-from .draw import Backend, Drawing, Player
+from .capture.images import composite
+from .draw import Drawing, Player, open_player
 from .errors import HoloreelError
-from .gaussians.decoder import Activation, decoder_path
+from .gaussians.decoder import Activation
 from .lpips import Lpips
-from .metrics import score
-from .reel import Loaded
+from .metrics import PSNR_MAX, bounding_box, score, subject_scores
+from .render import Backend
 
 VERSION = 1
 PAPER_FRAMES = 300  # the paper gives sizes per 300 frames, and per frame
+LPIPS_LEAST = 32  # pixels a side that the networks' layers leave something of
+DECIBELS = ("psnr", "psnr_mask")  # measures that are logarithms of a mean squared error
+
+OnProgress = Callable[[int, int], None]
+OnPicture = Callable[[str, int, Drawing], None]
 
 
 class Measured(NamedTuple):
@@ -34,85 +40,113 @@ def evaluate(
     capture: Capture,
     split: str = "test",
     backend: Backend = "auto",
-    on_progress: Callable[[int, int], None] | None = None,
-    on_picture: Callable[[str, int, Drawing], None] | None = None,
+    on_progress: OnProgress | None = None,
+    on_picture: OnPicture | None = None,
     decoder_output: Activation | None = None,
+    lpips: Sequence[Lpips] = (),
+) -> dict[str, Any]:
+    """Measure a file as `evaluate_player` does; `decoder_output` is as in `core.reel.load_gaussians`."""
+    player = open_player(path, backend, decoder_output=decoder_output)
+    return evaluate_player(player, capture, split, on_progress, on_picture, lpips)
+
+
+def evaluate_player(
+    player: Player,
+    capture: Capture,
+    split: str = "test",
+    on_progress: OnProgress | None = None,
+    on_picture: OnPicture | None = None,
     lpips: Sequence[Lpips] = (),
 ) -> dict[str, Any]:
     """Draw every picture of a split (`train`, `test` or `all`) and score it; return what `metrics.json` holds.
 
-    Drawings are measured as floats clipped to [0, 1], against the capture's 8-bit pictures / 255. Pixels of a distorted
-    lens that its warp cannot reach do not count; for LPIPS, which has no mask, they are taken from the truth.
+    Drawings are measured as floats clipped to [0, 1], against the capture's 8-bit pictures / 255. Pixels that the
+    player cannot reach do not count; for LPIPS and the measures of a subject, which have no mask, they are taken from
+    the truth. Where every picture of the capture tells its subject apart, the measures of `metrics.subject_scores` are
+    added, and what shows a subject alone is compared with it alone, over the reel's background.
+
     `on_progress(done, total)` is called after each picture, `on_picture(camera, frame, drawing)` with each drawing;
-    `frame` is the number on the timeline. `decoder_output` is as in `core.reel.load_gaussians`, `lpips` as
-    `core.lpips.load_lpips` returns it. Raises `HoloreelError` where the split is empty, or the reel does not cover the
-    capture's frames.
+    `frame` is the number on the timeline. `lpips` is as `core.lpips.load_lpips` returns it. Raises `HoloreelError`
+    where the split is empty, or the reel does not cover the capture's frames.
     """
-    player = Player(path, backend, decoder_output)
     views = capture.views(None if split == "all" else split)
     if not views:
         raise HoloreelError(
             f"{capture.source} has no pictures in the split '{split}': name another with --split, "
             "or make the capture with a camera held out."
         )
-    moments = player.frames_of(capture)
+    moments, masked = player.frames_of(capture), capture.masked
     rows: list[Measured] = []
     for name, index in views:
         frame = capture.frame_start + index
         drawing = player.draw(capture.cameras[name], moments[index])
-        truth = capture.image(name, index, background=player.first.background).astype(np.float32) / 255.0
-        mask = valid_pixels(capture.cameras[name])
-        scores = score(drawing.image, truth, mask)._asdict()
-        shown = drawing.image if mask is None else np.where(mask[..., None], drawing.image, truth)
-        scores |= {measure.name: measure(shown, truth) for measure in lpips}
-        rows.append(Measured(name, frame, scores))
+        truth, mask = _truth(player, capture, name, index, masked)
+        rows.append(Measured(name, frame, _scores(player, capture, name, drawing, truth, mask, lpips)))
         if on_picture:
             on_picture(name, frame, drawing)
         if on_progress:
             on_progress(len(rows), len(views))
+    cameras = list(dict.fromkeys(row.camera for row in rows))
     return {
         "version": VERSION,
         "reel": player.path.name,
         "capture": capture.source.resolve().parent.name,
         "split": split,
-        "backend": player.backend.__name__.rpartition(".")[2],
-        "gaussians": len(player.first.gaussians),
+        "backend": player.backend_name,
+        **player.facts(),
         "precision": "float drawings, 8-bit truth",
-        "size": model_size(player.first),
+        "size": sizes(player),
         **({"lpips_input": lpips[0].input_range} if lpips else {}),
         "mean": _mean(rows),
-        "cameras": {name: _mean(r for r in rows if r.camera == name) for name in dict.fromkeys(r.camera for r in rows)},
+        "pooled": _pooled(rows),
+        "cameras": {name: _mean(r for r in rows if r.camera == name) for name in cameras},
+        "pooled_cameras": {name: _pooled(r for r in rows if r.camera == name) for name in cameras},
         "frames": {str(frame): _mean(r for r in rows if r.frame == frame) for frame in sorted({r.frame for r in rows})},
         "views": [{"camera": row.camera, "frame": row.frame, **_rounded(row.scores)} for row in rows],
     }
 
 
-def valid_pixels(camera: Camera) -> NDArray[np.bool_] | None:
-    """Return the pixels (H, W) that a rendering of this camera can reach; None where it reaches all."""
-    if camera.model == "PINHOLE":
-        return None
-    from .render.warp import lens_warp
-
-    return lens_warp(camera).valid.numpy()
-
-
-def model_size(loaded: Loaded) -> dict[str, float]:
-    """Return the bytes that all Gaussians and decoders take on disk: in total, per frame, and per 300 frames.
-
-    A bare file's decoder counts too. A bare file does not know its frames: those that are assumed count.
-    """
-    if loaded.reel:
-        reel = loaded.reel
-        files = [reel.payload(index) for index in range(len(reel.segments))]
-        files += [file for index in range(len(reel.segments)) if (file := reel.decoder(index))]
-        frames = reel.frame_count
+def _truth(
+    player: Player, capture: Capture, name: str, index: int, masked: bool
+) -> tuple[NDArray[np.float32], NDArray[np.bool_] | None]:
+    """Return the picture (H, W, 3) that should have been drawn, and where its subject is (H, W) if that is known."""
+    rgba = capture.rgba(name, index) if masked else None
+    if rgba is not None and player.subject_alone:
+        picture = composite(rgba, player.background)
     else:
-        files, frames = [loaded.path], loaded.frame_count
-        if loaded.decoder:
-            ours = decoder_path(loaded.path)
-            files.append(ours if ours.is_file() else loaded.path.with_suffix(".pt"))
-    total = sum(file.stat().st_size for file in set(files))
-    per_frame = total / frames
+        picture = capture.image(name, index, background=player.background)
+    return picture.astype(np.float32) / 255.0, None if rgba is None else rgba[..., 3] > 0
+
+
+def _scores(
+    player: Player,
+    capture: Capture,
+    name: str,
+    drawing: Drawing,
+    truth: NDArray[np.float32],
+    mask: NDArray[np.bool_] | None,
+    lpips: Sequence[Lpips],
+) -> dict[str, float]:
+    reach = player.reach(capture.cameras[name])
+    shown = drawing.image if reach is None else np.where(reach[..., None], drawing.image, truth)
+    scores = score(drawing.image, truth, reach)._asdict()
+    if mask is not None:
+        scores |= subject_scores(shown, truth, mask if reach is None else mask & reach)
+    scores |= {measure.name: measure(shown, truth) for measure in lpips}
+    if lpips and mask is not None and mask.any():
+        box = bounding_box(mask)
+        if min(truth[box].shape[:2]) >= LPIPS_LEAST:
+            scores |= {f"{measure.name}_crop": measure(shown[box], truth[box]) for measure in lpips}
+    return scores
+
+
+def sizes(player: Player) -> dict[str, float]:
+    """Return the bytes that all a player needs takes on disk: in total, per frame, and per 300 frames.
+
+    A bare file does not know its frames: those that are assumed count.
+    """
+    total = player.size()
+    per_frame = total / player.frame_count
     return {
         "bytes": total,
         "bytes_per_frame": round(per_frame, 1),
@@ -121,8 +155,19 @@ def model_size(loaded: Loaded) -> dict[str, float]:
 
 
 def _mean(rows: Iterable[Measured]) -> dict[str, float]:
+    """Return the mean of each measure over the pictures that have it; decibels are averaged as they are."""
     every = [row.scores for row in rows]
-    return _rounded({name: float(np.mean([scores[name] for scores in every])) for name in every[0]})
+    names = dict.fromkeys(name for scores in every for name in scores)
+    return _rounded({name: float(np.mean([scores[name] for scores in every if name in scores])) for name in names})
+
+
+def _pooled(rows: Iterable[Measured]) -> dict[str, float]:
+    """Return the decibels of the mean squared error over all pictures, each with the same weight."""
+    every = [row.scores for row in rows]
+    errors = {name: [10.0 ** (-scores[name] / 10) for scores in every if name in scores] for name in DECIBELS}
+    return _rounded(
+        {name: min(-10.0 * math.log10(float(np.mean(part))), PSNR_MAX) for name, part in errors.items() if part}
+    )
 
 
 def _rounded(scores: dict[str, float]) -> dict[str, float]:

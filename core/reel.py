@@ -28,6 +28,7 @@ from .gaussians.model import SpacetimeGaussians
 from .gaussians.payload import PAYLOADS, find_decoder, read_payload, write_payload
 
 KIND = "spacetime_gaussians"
+VIDEORF = "videorf"  # the other kind of reel: `videorf.package`
 VERSION = 1
 UP_AXES = ("X", "-X", "Y", "-Y", "Z", "-Z")
 COLOR_SPACES = ("display",)  # colors are sRGB as displayed: what was seen in the 8-bit pictures, divided by 255
@@ -348,10 +349,27 @@ def _decoder_json(reel: Reel) -> dict[str, Any] | None:
     return {"output": reel.decoder_output} | ({"viewpoint": reel.viewpoint} if reel.viewpoint else {})
 
 
+def reel_kind(path: str | Path) -> str:
+    """Return the `kind` of a reel, "" where there is none or the file does not end in .reel. Reads no more than that.
+
+    Raises `HoloreelError` where the file is missing or no JSON.
+    """
+    path = Path(path)
+    if path.suffix.lower() != ".reel" or path.is_dir():
+        return ""
+    kind = read_json(path).get("kind")
+    return kind if isinstance(kind, str) else ""
+
+
 def read_reel(path: str | Path) -> Reel:
     """Read and check a manifest, not its payloads. Raises `HoloreelError` naming the field that is wrong."""
     path = Path(path)
     manifest = read_json(path)
+    if manifest.get("kind") == VIDEORF:
+        raise HoloreelError(
+            f"{path}: 'kind' is '{VIDEORF}', a video that holds no Gaussians: draw it with `holoreel render`, or make "
+            "points of it with `holoreel export --to points`."
+        )
     if manifest.get("kind") != KIND:
         raise HoloreelError(f"{path}: 'kind' is {manifest.get('kind')!r}, not '{KIND}'; give a reel of Gaussians.")
     version = manifest.get("version")

@@ -12,9 +12,10 @@ import torch
 
 from ..camera import Camera, read_camera
 from ..capture import read_capture
-from ..draw import Drawing, Player
+from ..draw import Drawing
 from ..errors import HoloreelError
 from ..gaussians.decoder import Activation
+from ..gaussians.player import GaussianPlayer
 from ..render import Backend
 
 PASSES, DROPPED = 4, 11  # the authors': passes over all frames, and how many at the start of each do not count
@@ -67,22 +68,27 @@ def measure(
     backend: Backend = "auto",
     decoder_output: Activation | None = None,
 ) -> Result:
-    """Draw all frames of a file as a camera sees them: `view`, or its CAMERA.json, or a capture's first camera.
+    """Measure a file as `measure_player` does: `view`, or its CAMERA.json, or a capture's first camera looks.
 
     `decoder_output` is as in `core.reel.load_gaussians`.
+    """
+    camera = view if isinstance(view, Camera) else _camera(view)
+    return measure_player(GaussianPlayer(path, backend, decoder_output), camera.scaled(*size) if size else camera)
+
+
+def measure_player(player: GaussianPlayer, camera: Camera) -> Result:
+    """Draw all frames of a file as a camera sees them.
 
     The ways take turns, pass by pass, so that a busy machine is busy for all. Raises `HoloreelError` where a frame is
     not the same in all of them.
     """
-    player = Player(path, backend, decoder_output)
-    camera = view if isinstance(view, Camera) else _camera(view)
-    if size:
-        camera = camera.scaled(*size)
     frames = [float(player.frame_start + index) for index in range(player.frame_count)]
     for frame in frames:  # also reads every segment and warms everything up
         wanted = _draw(player, camera, frame, METHODS[NOT_CULLED])
         if not all(_same(_draw(player, camera, frame, method), wanted) for method in METHODS.values()):
-            raise HoloreelError(f"{path}: frame {frame:g} is another picture without culling; report this as a bug.")
+            raise HoloreelError(
+                f"{player.path}: frame {frame:g} is another picture without culling; report this as a bug."
+            )
     seconds: dict[str, list[list[float]]] = {name: [] for name in METHODS}
     for _ in range(PASSES):
         for name, method in METHODS.items():
@@ -98,12 +104,12 @@ def _speed(passes: list[list[float]]) -> Speed:
     return Speed(1.0 / middle, 1.0 / statistics.mean(counted))
 
 
-def _draw(player: Player, camera: Camera, frame: float, method: Method) -> Drawing:
+def _draw(player: GaussianPlayer, camera: Camera, frame: float, method: Method) -> Drawing:
     rules = replace(player.rules, cull_faded=method.cull_faded)
     return player.draw(camera, frame, rules=rules, listed=method.listed)
 
 
-def _time(player: Player, camera: Camera, frame: float, method: Method) -> float:
+def _time(player: GaussianPlayer, camera: Camera, frame: float, method: Method) -> float:
     start = time.perf_counter()
     _draw(player, camera, frame, method)
     if torch.cuda.is_available():

@@ -8,11 +8,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..capture import Capture
-from ..draw import Backend, Player
 from ..errors import HoloreelError
 from ..files import write_json
+from ..gaussians.player import GaussianPlayer
 from ..images import write_png
 from ..metrics import psnr
+from ..render import Backend
 
 NEAR = 2  # frames on either side of a boundary that count as near it
 STILL = 2.0 / 255.0  # a pixel of the truth that changes less than this between two frames stands still
@@ -43,7 +44,7 @@ def measure_seams(path: Path, capture: Capture, camera: str | None = None, backe
 
     Raises `HoloreelError` where the reel is of one piece, or no camera is held out.
     """
-    player = Player(path, backend)
+    player = GaussianPlayer(path, backend)
     reel = player.first.reel
     if reel is None or len(reel.segments) < 2:
         raise HoloreelError(f"{path} has one segment, and so no seam: give a reel that was trained with --segment.")

@@ -9,13 +9,14 @@ import tyro
 from tqdm import tqdm
 
 from ..capture import CaptureOptions, read_capture
-from ..draw import Backend, Drawing
+from ..draw import Drawing, Quality, open_player
 from ..errors import HoloreelError
-from ..evaluate import evaluate
+from ..evaluate import evaluate_player
 from ..files import write_json
 from ..gaussians.decoder import Activation
 from ..images import picture_path, write_png
 from ..lpips import InputRange, Lpips, load_lpips
+from ..render import Backend
 from ..report.evaluation import as_text, merge, write_page
 
 NO_LPIPS = "LPIPS was not measured: it needs network weights that are not part of Holoreel (--lpips-weights)."
@@ -33,14 +34,18 @@ def run(
     lpips_weights: Path | None = None,
     lpips_heads: Path | None = None,
     lpips_input: InputRange = "paper",
+    rung: str | None = None,
+    quality: Quality | None = None,
     decoder_output: Activation | None = None,
     backend: Backend = "auto",
     options: Annotated[CaptureOptions, tyro.conf.arg(name="")] = CaptureOptions(),  # noqa: B008
 ) -> None:
     """Measure PSNR, SSIM, DSSIM1, DSSIM2 and, with weights, LPIPS per camera and frame; the model's size and its speed.
 
+    Where the capture tells its subject apart, also PSNR over the pixels of the mask and SSIM over its box.
+
     Args:
-        file: the .reel, .ply, .stgc or .splatv.
+        file: the .reel, .ply, .stgc or .splatv, or the NAME.model of a VideoRF.
         capture: folder of a capture in any layout that `holoreel info` knows.
         split: which cameras of the capture.
         out: folder for metrics.json, a page index.html and the drawn pictures (OUT/CAMERA/FRAME.png).
@@ -50,11 +55,16 @@ def run(
         lpips_weights: torchvision's alexnet-*.pth and/or vgg16-*.pth (or .safetensors): their folder, or one of them.
         lpips_heads: folder with the linear weights alex.pth and vgg.pth, if they are neither there nor installed.
         lpips_input: paper gives the networks pictures in [0, 1], standard in [-1, 1].
+        rung: of a VideoRF: which rate, by its QP as 20, or with its codec as hevc:20; the best without it.
+        quality: of a VideoRF: full takes the steps of its training, fast and draft longer ones; full without it.
         decoder_output: what the decoder of a bare .ply with a .pt beside it ends in; sigmoid without it.
         backend: which rasterizer.
         options: how the capture is read.
     """
     recording = read_capture(capture, options)
+    player = open_player(file, backend, decoder_output=decoder_output, rung=rung, quality=quality)
+    for sentence in player.report:
+        print(f"note: {sentence}", file=sys.stderr)
     measures = _lpips(lpips_weights, lpips_heads, lpips_input)
 
     def keep(camera: str, frame: int, drawing: Drawing) -> None:
@@ -67,12 +77,12 @@ def run(
             bar.total = total
             bar.update(done - bar.n)
 
-        metrics = evaluate(file, recording, split, backend, show, keep, decoder_output, measures)
+        metrics = evaluate_player(player, recording, split, show, keep, measures)
     if speed:
-        from ..bench.render import measure
+        from ..bench.play import measure_play
 
         name = recording.views(None if split == "all" else split)[0][0]
-        metrics["speed"] = measure(file, recording.cameras[name], None, backend, decoder_output).as_dict()
+        metrics["speed"] = measure_play(player, recording.cameras[name])
     print(as_text(metrics))
     if not measures:
         print(NO_LPIPS)

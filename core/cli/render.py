@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""`holoreel render FILE ...`: pictures of a reel, PLY or .splatv."""
+"""`holoreel render FILE ...`: pictures of a reel, PLY, .splatv or trained model."""
 
 import math
 import sys
@@ -12,11 +12,12 @@ from tqdm import tqdm
 
 from ..camera import read_camera
 from ..capture import Capture, read_capture
-from ..draw import Backend, Drawing, Player
+from ..draw import Drawing, Player, Quality, open_player
 from ..errors import HoloreelError
 from ..gaussians.decoder import Activation
 from ..images import picture_path, write_image
 from ..reel import Triple
+from ..render import Backend
 
 
 def run(
@@ -30,6 +31,8 @@ def run(
     frame: float | None = None,
     background: str | None = None,
     format: Literal["png", "exr"] = "png",
+    rung: str | None = None,
+    quality: Quality | None = None,
     decoder_output: Activation | None = None,
     backend: Backend = "auto",
 ) -> None:
@@ -38,15 +41,17 @@ def run(
     Colors are display-referred, in EXR as well; an EXR also holds alpha, and depth in its channel Z.
 
     Args:
-        file: the .reel, .ply, .stgc or .splatv.
+        file: the .reel, .ply, .stgc or .splatv, or the NAME.model of a VideoRF.
         out: FILE.png or FILE.exr for one camera; a folder for a set (OUT/CAMERA/FRAME.png).
         camera: CAMERA.json with model, width, height, fx, fy, cx, cy, world_to_camera.
         cameras: instead, a capture (folder or transforms.json) whose cameras look.
         split: which cameras of the capture.
         time: normalized time, 0 at the first frame, 1 after the last.
-        frame: instead, a frame of the timeline; sub-frames allowed.
-        background: color behind a lite model as R,G,B from 0 to 1; the reel's own without it.
+        frame: instead, a frame of the timeline; sub-frames allowed (a VideoRF shows the frame before).
+        background: color behind a lite model or a VideoRF as R,G,B from 0 to 1; the reel's own without it.
         format: what pictures of a set are written as.
+        rung: of a VideoRF: which rate, by its QP as 20, or with its codec as hevc:20; the best without it.
+        quality: of a VideoRF: full takes the steps of its training, fast and draft longer ones; full without it.
         decoder_output: what the decoder of a bare full model (.ply with a .pt beside it) ends in; sigmoid without it.
         backend: which rasterizer.
     """
@@ -61,8 +66,8 @@ def run(
     color = None if background is None else parse_color(background)
     one = read_camera(camera) if camera else None
     many = read_capture(cameras) if cameras else None
-    player = Player(file, backend, decoder_output)
-    if color is not None and player.first.decoder is not None:
+    player = open_player(file, backend, decoder_output=decoder_output, rung=rung, quality=quality)
+    if color is not None and not player.takes_background:
         raise HoloreelError(f"--background: the decoder of {file} colors every pixel; leave it away.")
     moment = frame if time is None else player.frame_at(time)
     for sentence in player.report:
@@ -79,14 +84,19 @@ def run(
 
 
 def plan(player: Player, capture: Capture, split: str, moment: float | None) -> list[tuple[str, float, str]]:
-    """Return camera name, frame to draw and file name of each picture of a set: all of the capture's frames, or one."""
+    """Return camera name, frame to draw and file name of each picture of a set: all of the capture's frames, or one.
+
+    Frames that a truncated file lost are left out, as the player's report says.
+    """
     names = capture.camera_names(None if split == "all" else split)
     if not names:
         raise HoloreelError(f"{capture.source} has no camera in the split '{split}': name another with --split.")
     if moment is not None:
         moments = [(moment, f"{moment:04g}")]
     else:
-        moments = [(shown, f"{capture.frame_start + j:04d}") for j, shown in enumerate(player.frames_of(capture))]
+        lost = set(player.missing())
+        numbered = enumerate(player.frames_of(capture), capture.frame_start)
+        moments = [(shown, f"{number:04d}") for number, shown in numbered if shown not in lost]
     return [(name, shown, label) for name in names for shown, label in moments]
 
 

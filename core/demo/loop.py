@@ -11,7 +11,7 @@ from typing import Any, Protocol
 
 from ..blender import Blender, run_in_blender
 from ..capture import Capture, read_capture
-from ..draw import Player
+from ..draw import open_player
 from ..errors import HoloreelError
 from ..evaluate import evaluate
 from ..files import write_json
@@ -137,7 +137,7 @@ def _render(
     frames = range(capture.frame_count)
     if engine == "EEVEE":
         frames = range(0, capture.frame_count, -(-capture.frame_count // EEVEE_PICTURES))
-    player, camera = Player(reel), capture.cameras[name]
+    player, camera = open_player(reel), capture.cameras[name]
     folder = settings.out / engine.lower()
     paths = {frame: folder / f"{name}-{capture.frame_start + frame:04d}.exr" for frame in frames}
     shots = [
@@ -167,7 +167,7 @@ def _move(settings: DemoSettings, reel: Path, capture: Capture, show: OnProgress
     last = capture.frame_count - 1
     cameras = orbit(list(capture.cameras.values()), MOVING_PICTURES)
     moments = [index / (MOVING_PICTURES - 1) * last for index in range(MOVING_PICTURES)]  # in frames of the reel
-    setting = {"reel": str(reel.absolute()), "background": list(Player(reel).first.background)}
+    setting = {"reel": str(reel.absolute()), "background": list(open_player(reel).background)}
     shots = [
         {
             "camera": camera.to_json(),

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..capture import Capture
-from ..draw import Player
+from ..draw import open_player
 from ..gaussians.run import RunPaths
 from ..images import read_image, write_png
 from ..report import Card, Picture, Report, Row, Section, Table, write_report
@@ -121,7 +121,7 @@ def _moving(out: Path, pictures: Path) -> Section:
 def _slices(pictures: Path, name: str, reel: Path, capture: Capture, truth: list[NDArray[np.float32]]) -> Section:
     """Follow the pixel column that changes most over time."""
     column = int(np.var(np.stack(truth), axis=0).mean(axis=(0, 2)).argmax())
-    player, camera = Player(reel), capture.cameras[name]
+    player, camera = open_player(reel), capture.cameras[name]
     moments = np.minimum(np.arange(capture.frame_count * SLICE_STEPS) / SLICE_STEPS, capture.frame_count - 1)
     drawn = [np.clip(player.draw(camera, capture.frame_start + float(at)).image, 0, 1) for at in moments]
     strips = {

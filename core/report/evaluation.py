@@ -1,12 +1,14 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """What `core.evaluate` measured, for people: lines of text, a page per reel, and one file for a dataset's scenes."""
 
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from ..errors import HoloreelError
+from ..evaluate import DECIBELS
 from ..files import read_json, write_json
 from . import Card, Report, Section, Table, write_report
 
@@ -15,14 +17,26 @@ LABELS = {
     "ssim": "SSIM",
     "dssim1": "DSSIM1",
     "dssim2": "DSSIM2",
+    "psnr_mask": "PSNR mask dB",
+    "ssim_crop": "SSIM crop",
+    "ssim_gauss": "SSIM 11x11",
     "lpips_alex": "LPIPS alex",
     "lpips_vgg": "LPIPS vgg",
+    "lpips_alex_crop": "LPIPS alex crop",
+    "lpips_vgg_crop": "LPIPS vgg crop",
 }
 
 
-def cells(means: dict[str, float]) -> list[str]:
-    """Return measures as text, in the order of `LABELS`."""
-    return [f"{means[name]:.2f}" if name == "psnr" else f"{means[name]:.4f}" for name in LABELS if name in means]
+def cells(means: dict[str, float], names: Iterable[str] | None = None) -> list[str]:
+    """Return measures as text, in the order of `LABELS`: those in `names`, or all that are there."""
+    wanted = means if names is None else set(names)
+    return [_cell(name, means) for name in LABELS if name in wanted]
+
+
+def _cell(name: str, means: dict[str, float]) -> str:
+    if name not in means:
+        return "-"
+    return f"{means[name]:.2f}" if name in DECIBELS else f"{means[name]:.4f}"
 
 
 def headings(means: dict[str, float]) -> list[str]:
@@ -37,7 +51,7 @@ def as_text(metrics: dict[str, Any]) -> str:
     labels = headings(metrics["mean"])
     lines = [" " * width + "".join(f"  {label:>7}" for label in labels)]
     for name, means in rows:
-        texts = zip(labels, cells(means), strict=True)
+        texts = zip(labels, cells(means, metrics["mean"]), strict=True)
         lines.append(f"{name:{width}}" + "".join(f"  {text:>{max(len(label), 7)}}" for label, text in texts))
     return "\n".join([*lines, *remarks(metrics)])
 
@@ -49,12 +63,14 @@ def remarks(metrics: dict[str, Any]) -> list[str]:
         f"{size['bytes'] / 1e6:.2f} MB on disk, {size['bytes_per_frame'] / 1e3:.1f} kB per frame, "
         f"{size['bytes_per_300_frames'] / 1e6:.1f} MB per 300 frames."
     ]
+    lines += [f"Rung {name}: {text}" for name, text in metrics.get("rungs", {}).items()]
     if "speed" in metrics:
-        speed = metrics["speed"]
-        played, plain = speed["speeds"]["listed"], speed["speeds"]["not culled"]
+        lines.append(metrics["speed"]["sentence"])
+    pooled = metrics["pooled"]
+    if "psnr_mask" in pooled:
         lines.append(
-            f"{played['fps']:.1f} frames per second at {speed['width']}x{speed['height']}; by the authors' protocol, "
-            f"which leaves out no Gaussian, {plain['authors_fps']:.1f}."
+            f"From the mean squared error of all pictures: {pooled['psnr']:.2f} dB, {pooled['psnr_mask']:.2f} dB over "
+            "the pixels of the masks."
         )
     lines.append(f"Compared: {metrics['precision']}.")
     return lines
@@ -67,9 +83,11 @@ def write_page(path: Path, metrics: dict[str, Any]) -> Path:
     cards = [Card(label, text) for label, text in zip(labels, cells(mean), strict=True)]
     cards.append(Card("Size", f"{size['bytes'] / 1e6:.2f} MB", f"{size['bytes_per_frame'] / 1e3:.1f} kB per frame"))
     if "speed" in metrics:
-        cards.append(Card("Frames per second", f"{metrics['speed']['speeds']['listed']['fps']:.1f}"))
+        cards.append(Card("Frames per second", f"{metrics['speed']['fps']:.1f}"))
     sections = [
-        Section(title, table=Table((title, *labels), tuple((name, *cells(means)) for name, means in rows.items())))
+        Section(
+            title, table=Table((title, *labels), tuple((name, *cells(means, mean)) for name, means in rows.items()))
+        )
         for title, rows in (("Camera", metrics["cameras"]), ("Frame", metrics["frames"]))
     ]
     intro = f"{metrics['reel']} against the {metrics['split']} pictures of {metrics['capture']}. "

@@ -32,7 +32,7 @@ class Recording:
 def recording(tmp_path_factory: pytest.TempPathFactory, random_model: Callable[..., SpacetimeGaussians]) -> Recording:
     """Draw a random model over a background with two cameras; nothing here may be changed."""
     from holoreel.core.camera import write_camera
-    from holoreel.core.draw import draw, to_tensors
+    from holoreel.core.gaussians.player import draw, to_tensors
     from holoreel.core.images import picture_path, write_png
     from holoreel.core.render import get_backend
 

@@ -6,15 +6,16 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from holoreel.core import evaluate as evaluation
 from holoreel.core.capture import read_capture
 from holoreel.core.cli import main
-from holoreel.core.evaluate import evaluate, model_size, valid_pixels
+from holoreel.core.draw import open_player
+from holoreel.core.evaluate import evaluate, sizes
 from holoreel.core.gaussians.decoder import Decoder, write_pt
+from holoreel.core.gaussians.player import GaussianPlayer
 from holoreel.core.gaussians.ply import write_ply
 from holoreel.core.images import read_image
 from holoreel.core.metrics import score
-from holoreel.core.reel import SegmentPayload, load_gaussians, save_gaussians, write_segments
+from holoreel.core.reel import SegmentPayload, save_gaussians, write_segments
 
 
 def test_the_truth_scores_what_8_bits_allow(recording, tmp_path, capsys):
@@ -108,7 +109,7 @@ def test_sizes_count_every_payload(recording, tmp_path):
     )
     files = [*tmp_path.glob("*.ply"), *tmp_path.glob("*.safetensors")]
     assert len(files) == 4
-    size = model_size(load_gaussians(reel.path))
+    size = sizes(open_player(reel.path, "reference"))
     total = sum(file.stat().st_size for file in files)
     assert size["bytes"] == total
     assert size["bytes_per_frame"] == pytest.approx(total / 3, abs=0.1)
@@ -136,7 +137,7 @@ def test_pixels_out_of_a_lens_reach_do_not_count(recording, monkeypatch):
     capture = read_capture(recording.capture)
     half = np.zeros((24, 32), bool)
     half[:, 16:] = True
-    monkeypatch.setattr(evaluation, "valid_pixels", lambda camera: half)
+    monkeypatch.setattr(GaussianPlayer, "reach", lambda player, camera: half)
     model = recording.model.take([0])
     model.opacity_logits[:] = -30.0
     reel = recording.folder / "out" / "gray-half.reel"
@@ -163,9 +164,10 @@ def test_pixels_out_of_a_lens_reach_do_not_count(recording, monkeypatch):
 
 def test_only_distorted_lenses_are_masked(recording):
     camera = recording.cameras["left"]
-    assert valid_pixels(camera) is None
+    player = open_player(recording.reel, "reference")
+    assert player.reach(camera) is None
     fisheye = replace(camera, model="OPENCV_FISHEYE", fx=8.0, fy=8.0, distortion=(0.0, 0.0, 0.0, 0.0))
-    valid = valid_pixels(fisheye)
+    valid = player.reach(fisheye)
     assert valid.shape == (24, 32)
     assert valid[12, 16]
     assert not valid[0, 0]  # 143 degrees off the axis: behind the lens

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from holoreel.core.camera import Camera
 from holoreel.core.cli import main
-from holoreel.core.draw import Player
+from holoreel.core.draw import open_player
 from holoreel.core.gaussians.model import SpacetimeGaussians
 from holoreel.core.images import read_exr, read_image
 from holoreel.core.reel import Segment, read_reel, save_gaussians, write_reel
@@ -35,7 +35,7 @@ def test_exr_has_floats_alpha_and_depth(recording, tmp_path):
     out = tmp_path / "a.exr"
     look = ("--camera", recording.camera, "--frame", 102.5, "--out", out)
     assert render(recording.reel, *look, "--background", "0,0,0") == 0
-    drawing = Player(recording.reel, "reference").draw(recording.cameras["left"], 102.5, (0.0, 0.0, 0.0))
+    drawing = open_player(recording.reel, "reference").draw(recording.cameras["left"], 102.5, (0.0, 0.0, 0.0))
     image, depth = read_exr(out)
     np.testing.assert_array_equal(image[:, :, :3], drawing.image)
     np.testing.assert_array_equal(image[:, :, 3], drawing.alpha)
@@ -82,7 +82,7 @@ def test_frames_find_their_segment(tmp_path):
     reel = replace(read_reel(tmp_path / "a.reel"), segments=(Segment("a.ply", 11, 4), Segment("b.ply", 15, 4)),
                    frame_count=8)  # fmt: skip
     write_reel(reel)
-    player = Player(tmp_path / "a.reel", "reference")
+    player = open_player(tmp_path / "a.reel", "reference")
     camera = Camera(64, 48, 60.0, 60.0, 32.0, 24.0)
     for frame in (11, 12, 13.5, 15, 17, 18, 12):
         alpha = player.draw(camera, frame).alpha

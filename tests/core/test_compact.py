@@ -8,11 +8,11 @@ from contextlib import suppress
 
 import numpy as np
 import pytest
-from holoreel.core.draw import Player
 from holoreel.core.errors import HoloreelError
 from holoreel.core.gaussians.compact import STEPS, read_compact, write_compact
 from holoreel.core.gaussians.decoder import Decoder
 from holoreel.core.gaussians.model import ROWS, sigmoid
+from holoreel.core.gaussians.player import GaussianPlayer
 from holoreel.core.gaussians.ply import write_ply
 from holoreel.core.gaussians.splatv import read_splatv
 from holoreel.core.reel import SegmentPayload, load_gaussians, read_reel, write_segments
@@ -139,7 +139,9 @@ def test_a_fourth_of_the_size_at_no_visible_loss(shared_data, tmp_path):
     assert 4 * (tmp_path / "a.stgc").stat().st_size <= (tmp_path / "a.ply").stat().st_size
     camera = Camera(320, 240, 290.0, 290.0, 160.0, 120.0)
     for frame in (0, 25):
-        exact, read = (Player(tmp_path / name).draw(camera, frame).image.clip(0, 1) for name in ("a.ply", "a.stgc"))
+        exact, read = (
+            GaussianPlayer(tmp_path / name).draw(camera, frame).image.clip(0, 1) for name in ("a.ply", "a.stgc")
+        )
         assert exact.std() > 0.05
         # So little that a model 33 dB from the truth loses less than 0.1 dB.
         assert -10 * np.log10(np.mean((exact - read) ** 2)) > 49.0

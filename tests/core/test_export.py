@@ -10,10 +10,10 @@ import pytest
 import torch
 from holoreel.core.camera import Camera, write_camera
 from holoreel.core.cli import main
-from holoreel.core.draw import Player
 from holoreel.core.gaussians.decoder import Decoder, write_pt
 from holoreel.core.gaussians.flat import flat_colors
 from holoreel.core.gaussians.model import SpacetimeGaussians, sigmoid
+from holoreel.core.gaussians.player import GaussianPlayer
 from holoreel.core.gaussians.ply import read_ply, write_ply
 from holoreel.core.gaussians.splatv import read_splatv
 from holoreel.core.plyfile import read_vertices
@@ -141,8 +141,8 @@ def test_a_moment_is_an_ordinary_gaussian_ply(tmp_path, random_model):
     lengths = sum(table[f"rot_{i}"].astype(float) ** 2 for i in range(4))
     np.testing.assert_allclose(lengths, 1.0, atol=1e-5)
     camera = Camera(64, 48, 60.0, 60.0, 32.0, 24.0)
-    moving = Player(tmp_path / "a.reel", "reference").draw(camera, 14.5).image
-    np.testing.assert_allclose(Player(out, "reference").draw(camera, 20).image, moving, atol=2e-4)
+    moving = GaussianPlayer(tmp_path / "a.reel", "reference").draw(camera, 14.5).image
+    np.testing.assert_allclose(GaussianPlayer(out, "reference").draw(camera, 20).image, moving, atol=2e-4)
 
 
 def test_a_range_of_moments_goes_over_a_seam(tmp_path, random_model, capsys):
@@ -174,7 +174,7 @@ def test_flat_colors_are_those_of_opaque_pixels(tmp_path, decoder):
     pose[:3, 3] = (0.1, -0.2, 0.3)
     camera = Camera(64, 64, 60.0, 60.0, 32.0, 32.0, pose)
     save_gaussians(tmp_path / "a.reel", model, decoder=decoder, fps=24, frame_start=0, frame_count=4)
-    image = Player(tmp_path / "a.reel", "reference").draw(camera, 3).image
+    image = GaussianPlayer(tmp_path / "a.reel", "reference").draw(camera, 3).image
     (u, v), _ = (part[0] for part in camera.project(model.means))
     flat = flat_colors(model, decoder, camera.center, 0.75)[0]
     assert np.abs(flat - image[int(v), int(u)]).max() < 0.02  # alpha is at most 0.99
@@ -235,7 +235,8 @@ def test_compact_reels_are_whole_reels(tmp_path, random_model, decoder):
     assert load_gaussians(tmp_path / "c.stgc").decoder.activation == "sigmoid"
     camera = Camera(64, 48, 60.0, 60.0, 32.0, 24.0)
     exact, read = (
-        Player(path, "reference").draw(camera, 6).image for path in (tmp_path / "a.reel", tmp_path / "small" / "b.reel")
+        GaussianPlayer(path, "reference").draw(camera, 6).image
+        for path in (tmp_path / "a.reel", tmp_path / "small" / "b.reel")
     )
     assert np.abs(exact - exact.mean()).max() > 0.1
     assert np.mean((exact - read) ** 2) < 1e-4

@@ -6,9 +6,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from holoreel.core.camera import Camera
-from holoreel.core.draw import Player, draw, to_tensors
 from holoreel.core.errors import HoloreelError
 from holoreel.core.gaussians.decoder import Decoder, write_pt
+from holoreel.core.gaussians.player import GaussianPlayer, draw, to_tensors
 from holoreel.core.gaussians.ply import write_ply
 from holoreel.core.reel import SegmentPayload, load_gaussians, save_gaussians, write_segments
 from holoreel.core.render import get_backend
@@ -118,7 +118,7 @@ def test_pictures_are_what_the_formulas_say(tmp_path, full, activation, backend)
         get_backend(backend)
     except HoloreelError as error:
         pytest.skip(str(error))
-    player, pose = Player(tmp_path / "a.reel", backend), camera()
+    player, pose = GaussianPlayer(tmp_path / "a.reel", backend), camera()
     pictures = []
     for frame in (1, 3.5, 8):
         drawn = player.draw(pose, frame)
@@ -134,7 +134,7 @@ def test_pictures_are_what_the_formulas_say(tmp_path, full, activation, backend)
 def test_a_full_model_ignores_the_background(tmp_path, full):
     model, hidden, output = full
     save_gaussians(tmp_path / "a.reel", model, decoder=Decoder(hidden, output), fps=24, frame_start=1, frame_count=8)
-    player = Player(tmp_path / "a.reel", "reference")
+    player = GaussianPlayer(tmp_path / "a.reel", "reference")
     plain, over = player.draw(camera(), 3), player.draw(camera(), 3, (1.0, 0.0, 0.5))
     np.testing.assert_array_equal(plain.image, over.image)
 
@@ -152,9 +152,9 @@ def test_the_authors_files_are_drawn_alike(tmp_path, full):
             tmp_path / "a.reel", model, decoder=Decoder(hidden, output, said or "sigmoid"),
             fps=30, frame_start=0, frame_count=50,
         )  # fmt: skip
-        bare = Player(tmp_path / "point_cloud.ply", "reference", said)
+        bare = GaussianPlayer(tmp_path / "point_cloud.ply", "reference", said)
         assert any("a sigmoid is assumed" in sentence for sentence in bare.report) == (said is None)
-        truth = Player(tmp_path / "a.reel", "reference").draw(camera(), 20)
+        truth = GaussianPlayer(tmp_path / "a.reel", "reference").draw(camera(), 20)
         np.testing.assert_array_equal(bare.draw(camera(), 20).image, truth.image)
     (tmp_path / "point_cloud.pt").write_bytes(b"no state dict")
     with pytest.raises(HoloreelError, match=r"point_cloud\.pt is not the state dict of a decoder"):
@@ -166,7 +166,7 @@ def test_each_segment_has_its_own_network(tmp_path, full):
     decoders = [Decoder(hidden, output), Decoder(-hidden, output)]
     parts = [SegmentPayload(model, decoder, 1 + 4 * index, 4) for index, decoder in enumerate(decoders)]
     write_segments(tmp_path / "a.reel", parts, fps=24, frame_start=1)
-    player = Player(tmp_path / "a.reel", "reference")
+    player = GaussianPlayer(tmp_path / "a.reel", "reference")
     for frame in (2, 6, 3, 7):
         decoder = decoders[frame > 4]
         time = (frame - 1) % 4 / 4

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 import torch
 from holoreel.core.camera import Camera, read_camera
-from holoreel.core.draw import Player
 from holoreel.core.errors import HoloreelError
+from holoreel.core.gaussians.player import GaussianPlayer
 from holoreel.core.render import cpu, reference
 from holoreel.core.render.contract import DensityStats, Rules, SpacetimeTensors, listed
 from holoreel.core.render.lifetimes import Lifetimes
@@ -116,7 +116,7 @@ def test_bad_lists_are_refused() -> None:
 
 def test_the_player_lists_unless_all_shall_be_drawn(recording, monkeypatch) -> None:
     """What is timed as the authors draw must not profit from lists."""
-    player = Player(recording.reel, "cpu")
+    player = GaussianPlayer(recording.reel, "cpu")
     seen = []
     honest = cpu.rasterize_spacetime
     monkeypatch.setattr(cpu, "rasterize_spacetime", lambda *a, **k: seen.append(a[6]) or honest(*a, **k))

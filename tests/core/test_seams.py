@@ -11,8 +11,8 @@ import pytest
 from holoreel.core.bench.seams import measure_seams
 from holoreel.core.capture import Capture
 from holoreel.core.cli import main
-from holoreel.core.draw import draw, to_tensors
 from holoreel.core.gaussians.model import SpacetimeGaussians
+from holoreel.core.gaussians.player import draw, to_tensors
 from holoreel.core.images import write_png
 from holoreel.core.reel import SegmentPayload, write_segments
 from holoreel.core.render import get_backend

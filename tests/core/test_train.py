@@ -13,11 +13,11 @@ import torch
 from holoreel.core.camera import Camera
 from holoreel.core.capture import Capture, Points, read_capture, write_capture, write_points
 from holoreel.core.cli import main
-from holoreel.core.draw import Player
 from holoreel.core.errors import HoloreelError
 from holoreel.core.gaussians.config import PRESETS, DensityConfig, GuidedConfig, LearningRates, McmcConfig, TrainConfig
 from holoreel.core.gaussians.model import SpacetimeGaussians
 from holoreel.core.gaussians.parameters import Parameters
+from holoreel.core.gaussians.player import GaussianPlayer
 from holoreel.core.gaussians.run import RunPaths, train_reel
 from holoreel.core.gaussians.train import Trainer, valid_pixels
 from holoreel.core.reel import load_gaussians, read_reel
@@ -391,7 +391,7 @@ def test_a_tiny_world_is_played_as_it_was_trained(capture: Capture, tmp_path: Pa
     tiny = moved(capture, tmp_path, 1e-3, 0.4)
     trained = train_reel(tiny, tmp_path / "t.reel", replace(QUICK, iterations=80), get_backend(), lambda progress: None)
     assert read_reel(trained.reel.path).near < 3e-3
-    player = Player(trained.reel.path)
+    player = GaussianPlayer(trained.reel.path)
     picture = player.draw(tiny.cameras["cam00"], player.frame_start).image
     assert np.mean((picture - capture.image("cam00", 0) / 255.0) ** 2) < 0.01
 
