@@ -1,81 +1,53 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""`holoreel train stg CAPTURE --out REEL`: train Spacetime Gaussians."""
+"""`holoreel train METHOD CAPTURE --out REEL`: train a reel. Each method is a module with the functions named below."""
 
-from collections.abc import Callable
-from pathlib import Path
-from typing import Annotated, Literal
+import importlib
+from collections.abc import Callable, Mapping
+from typing import Annotated, Any, Literal, Protocol, cast
 
 import tyro
-from tqdm import tqdm
 
-from ..capture import Capture, CaptureOptions, read_capture
-from ..draw import Backend
 from ..errors import HoloreelError
-from ..gaussians.config import PRESETS, TrainConfig
-from ..gaussians.run import RunPaths, train_reel
-from ..gaussians.train import Progress
-from ..render import get_backend
+
+METHODS = {"stg": "train_stg", "videorf": "train_videorf"}
+
+
+class Method(Protocol):
+    """What the module of a method has: its settings by the name of a preset, and the command they are defaults of."""
+
+    PRESETS: Mapping[str, Any]
+    DEFAULT: str
+
+    def command(self, preset: str) -> Callable[..., None]:
+        """Return the function whose arguments are the command line, with a preset's settings as defaults."""
 
 
 def prepare(arguments: list[str]) -> Callable[..., None]:
-    """Return the command with the defaults of the preset that the arguments name."""
-    preset = "lite"
+    """Return the command of the method that the arguments name, with the defaults of the preset that they name."""
+    name = next((argument for argument in arguments if not argument.startswith("-")), "")
+    if name not in METHODS:
+        return run
+    method = cast(Method, importlib.import_module(f".{METHODS[name]}", __package__))
+    preset = _preset(arguments) or method.DEFAULT
+    if preset not in method.PRESETS:
+        raise HoloreelError(f"--preset {preset}: no such preset; take one of {', '.join(method.PRESETS)}.")
+    return method.command(preset)
+
+
+def run(method: Annotated[Literal["stg", "videorf"], tyro.conf.Positional]) -> None:
+    """Train a reel from a capture; `holoreel train METHOD --help` explains each method.
+
+    Args:
+        method: `stg`, Spacetime Gaussians, for whole scenes; `videorf`, a radiance field as a video of features, for a
+            subject with masks.
+    """
+    raise HoloreelError(f"there is no method {method!r} here.")
+
+
+def _preset(arguments: list[str]) -> str | None:
     for index, argument in enumerate(arguments):
         if argument == "--preset" and index + 1 < len(arguments):
-            preset = arguments[index + 1]
-        elif argument.startswith("--preset="):
-            preset = argument.partition("=")[2]
-    if preset not in PRESETS:
-        raise HoloreelError(f"--preset {preset}: no such preset; take one of {', '.join(PRESETS)}.")
-
-    def run(
-        method: tyro.conf.Positional[Literal["stg"]],
-        capture: tyro.conf.Positional[Path],
-        /,
-        out: Path,
-        preset: str = preset,
-        resume: bool = False,
-        backend: Backend = "auto",
-        options: Annotated[CaptureOptions, tyro.conf.arg(name="")] = CaptureOptions(),  # noqa: B008
-        config: Annotated[TrainConfig, tyro.conf.arg(name="")] = PRESETS[preset],
-    ) -> None:
-        """Train a reel from a capture. Ctrl-C leaves a checkpoint beside the reel.
-
-        Args:
-            method: what to train: stg, Spacetime Gaussians.
-            capture: folder of a capture in any layout that `holoreel info` knows.
-            out: the reel to write, NAME.reel.
-            preset: settings to start from; the flags below change them.
-            resume: go on from the checkpoint of a stopped run.
-            backend: which rasterizer.
-            options: how the capture is read.
-            config: the preset's settings.
-        """
-        train(read_capture(capture, options), out, resume, backend, config)
-
-    return run
-
-
-def train(capture: Capture, out: Path, resume: bool, backend: Backend, config: TrainConfig) -> None:
-    """Train with a progress line on the terminal."""
-    for note in capture.notes:
-        print(note)
-    with tqdm(unit="it", dynamic_ncols=True, desc="train") as bar:
-
-        def show(progress: Progress) -> None:
-            bar.n, bar.total = progress.iteration, progress.iterations
-            bar.set_postfix(
-                loss=f"{progress.loss:.4f}", psnr=f"{progress.psnr:.2f}", gaussians=progress.gaussians, refresh=True
-            )
-
-        try:
-            trained = train_reel(capture, out, config, get_backend(backend), show, resume)
-        except KeyboardInterrupt:
-            bar.close()
-            print(f"checkpoint: {RunPaths(out).checkpoint} (go on with --resume)")
-            raise
-    segments = len(trained.reel.segments)
-    print(
-        f"{out}: {trained.gaussians} Gaussians{f' in {segments} segments' if segments > 1 else ''}, "
-        f"trained in {trained.seconds:.0f} s"
-    )
+            return arguments[index + 1]
+        if argument.startswith("--preset="):
+            return argument.partition("=")[2]
+    return None

@@ -41,7 +41,7 @@ class VideoConfig:
     """frames share mapping tables (Eq. 4); without, every frame has its own"""
     longest: int = LONGEST
     """frames in a group at most: a player that seeks decodes half a group on average"""
-    layout: Layout = "blocks"
+    image_layout: Layout = "blocks"
     """how vertices are laid out in the image: blocks is the paper's; macroblocks and superblocks also put blocks in
     Morton order inside squares of 16 and 64 pixels; raster has no Morton order, rows no blocks"""
     features: int = 7
@@ -159,8 +159,8 @@ PRESETS = {
 ABLATIONS: dict[str, dict[str, object]] = {
     "no spatial loss": {"spatial": 0.0},
     "no temporal loss": {"temporal": 0.0},
-    "no Morton order": {"layout": "raster"},
-    "no blocks": {"layout": "rows"},
+    "no Morton order": {"image_layout": "raster"},
+    "no blocks": {"image_layout": "rows"},
     "no grouping": {"grouping": False},
 }
 

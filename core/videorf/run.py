@@ -23,7 +23,8 @@ from ..capture import Capture
 from ..errors import HoloreelError
 from ..files import atomic_path, read_json, write_json
 from ..runs import claim_run, differences
-from .coarse import Coarse, occupancy_of, one_torch_thread, read_coarse, train_coarse
+from .coarse import Coarse, occupancy_of, one_torch_thread
+from .coarse_frames import CoarseJob, train_coarse_frames
 from .codec import check_rung
 from .config import VideoConfig
 from .deferred import DeferredShading
@@ -124,14 +125,18 @@ def train_video(
     config: VideoConfig | None = None,
     on_progress: Listener = lambda progress: None,
     resume: bool = False,
+    *,
     coarse: Path | None = None,
+    workers: int = 1,
+    keep_model: bool = True,
 ) -> TrainedVideo:
     """Train a VideoRF from a capture and write it to `out` (a `.reel` path), its model beside it.
 
     `coarse` is a folder of coarse fields to take, or to fill, instead of the run's own: runs that differ in later
-    stages share it. When stopped, the run goes on with `resume` behind the last frame that was finished, and ends in
-    the same bits. Raises `HoloreelError` where `out` cannot be written, the checkpoint or the shared folder belongs to
-    other settings, the capture has no masks, or a frame does not fit into the image.
+    stages share it. So many `workers` train them at once. Without `keep_model`, the returned model has lost its rows
+    once the run is over. When stopped, the run goes on with `resume` behind the last frame that was finished, and ends
+    in the same bits. Raises `HoloreelError` where `out` cannot be written, the checkpoint or the shared folder belongs
+    to other settings, the capture has no masks, or a frame does not fit into the image.
     """
     config = config or VideoConfig()
     paths = RunPaths(out)
@@ -144,15 +149,17 @@ def train_video(
             f"{capture.source}: a VideoRF is of a subject alone, and not all pictures have masks or transparency; give "
             "masks, render over a transparent film, or train Spacetime Gaussians (stg)."
         )
-    _claim_settings(paths.settings, {"config": asdict(config), "capture": _identity(capture)}, "--resume")
-    run = _Run(capture, config, paths, coarse or paths.coarse, on_progress)
+    _claim_settings(paths.settings, {"config": asdict(config), "capture": _identity(capture)})
+    run = _Run(capture, config, paths, coarse or paths.coarse, workers, on_progress)
     with one_torch_thread():
         model = run.model()
     reel = run.encode(model, rungs)
-    shutil.rmtree(paths.model, ignore_errors=True)
-    paths.partial.rename(paths.model)
+    if keep_model:
+        shutil.rmtree(paths.model, ignore_errors=True)
+        paths.partial.rename(paths.model)
+        model = read_field_video(paths.model)
     shutil.rmtree(paths.checkpoint, ignore_errors=True)
-    return TrainedVideo(reel, read_field_video(paths.model), run.clock.seconds)
+    return TrainedVideo(reel, model, run.clock.seconds)
 
 
 @dataclass
@@ -176,14 +183,21 @@ class _Run:
     """The stages of one run."""
 
     def __init__(
-        self, capture: Capture, config: VideoConfig, paths: RunPaths, coarse_folder: Path, on_progress: Listener
+        self,
+        capture: Capture,
+        config: VideoConfig,
+        paths: RunPaths,
+        coarse_folder: Path,
+        workers: int,
+        on_progress: Listener,
     ) -> None:
-        self.capture, self.config, self.paths, self.coarse_folder = capture, config, paths, coarse_folder
+        self.capture, self.config, self.paths, self.workers = capture, config, paths, workers
         self.on_progress, self.clock = on_progress, _Clock()
         self.frames = capture.frame_count
         low, high = subject_bounds(capture)
         self.lattice = Lattice.around(low, high, config.resolution)
-        self.coarse_lattice = Lattice.around(low, high, max(8, round(config.resolution * config.coarse_share)))
+        coarse_lattice = Lattice.around(low, high, max(8, round(config.resolution * config.coarse_share)))
+        self.job = CoarseJob(capture, coarse_lattice, coarse_folder, config.coarse, config.seed, border=config.border)
         self.groups: tuple[Group, ...] = ()
         self.tables: tuple[MappingTable, ...] = ()
         self.network = new_network(config)
@@ -218,7 +232,7 @@ class _Run:
         size = self._image_size(max(int(occupancy.sum()) for occupancy in occupancies))
         longest = self.config.longest if self.config.grouping else 1
         self.groups = tuple(group_frames(occupancies, size[0] * size[1], longest))
-        self.tables = tuple(build_table(group.union, size, self.config.layout) for group in self.groups)
+        self.tables = tuple(build_table(group.union, size, self.config.image_layout) for group in self.groups)
         learning = min(self.config.shading_groups, len(self.groups))
         self.planned = self._plan(learning, len(self.groups) - learning)
         with self.clock.of("shading"):
@@ -232,42 +246,40 @@ class _Run:
 
     def _coarse_stage(self) -> list[Occupancy]:
         """Make the coarse fields that are missing, and return the occupancy of every frame."""
-        config = self.config
+        config, job = self.config, self.job
         settings = {
             "capture": _identity(self.capture),
             "lattice": asdict(self.lattice),
-            "coarse_lattice": asdict(self.coarse_lattice),
+            "coarse_lattice": asdict(job.lattice),
             "config": asdict(config.coarse),
             **{name: getattr(config, name) for name in ("gamma", "weight_share", "border", "seed")},
         }
-        _claim_settings(self.coarse_folder / "settings.json", settings, "the coarse fields")
-        occupancies = []
-        for frame in range(self.frames):
-            path = self.coarse_folder / f"occupancy_{frame:06d}.npy"
-            if path.exists() and self._coarse_path(frame).exists():
-                self._skip(config.coarse.iterations)
-                occupancies.append(_read_occupancy(path, self.lattice.shape))
-                continue
+        _claim_settings(job.folder / "settings.json", settings)
+        done = [0] * self.frames
+
+        def tell(frame: int, iteration: int, psnr: float) -> None:
+            self._tell("coarse", frame, psnr, iteration - done[frame])
+            done[frame] = iteration
+
+        self._skip(config.coarse.iterations * sum(job.path(frame).is_file() for frame in range(self.frames)))
+        train_coarse_frames(job, range(self.frames), self.workers, tell)
+        return [self._occupancy(frame) for frame in range(self.frames)]
+
+    def _occupancy(self, frame: int) -> Occupancy:
+        """Return the occupancy of a frame, from its file where there is one."""
+        config, path = self.config, self.job.folder / f"occupancy_{frame:06d}.npy"
+        if not path.exists():
             views = FrameViews(self.capture, frame, border=config.border)
-            before = self.done
-
-            def tell(iteration: int, psnr: float, frame: int = frame, before: int = before) -> None:
-                self._tell("coarse", frame, psnr, before + iteration - self.done)
-
-            found = train_coarse(views, self.coarse_lattice, config.coarse, config.seed, tell)
             hull = visual_hull(views, self.lattice, config.coarse.misses, config.coarse.reach)
-            occupancy = occupancy_of(found, self.lattice, hull, config.gamma, config.weight_share)
-            found.write(self._coarse_path(frame))
+            found = occupancy_of(self.job.read(frame), self.lattice, hull, config.gamma, config.weight_share)
             with atomic_path(path) as temporary:
-                np.save(temporary, np.packbits(occupancy), allow_pickle=False)
-            occupancies.append(occupancy)
-            self.done = before + config.coarse.iterations
-        return occupancies
+                np.save(temporary, np.packbits(found), allow_pickle=False)
+        return _read_occupancy(path, self.lattice.shape)
 
     def _image_size(self, fullest: int) -> tuple[int, int]:
         """Return the (height, width) of the feature images: as told, or what the fullest frame and headroom need."""
         config = self.config
-        unit = SUPERBLOCK if config.layout == "superblocks" else MACROBLOCK
+        unit = SUPERBLOCK if config.image_layout == "superblocks" else MACROBLOCK
         edge = config.image
         if edge == 0:
             needed = math.ceil(math.sqrt(fullest * config.headroom) / unit) * unit
@@ -355,12 +367,9 @@ class _Run:
 
     # -- what lies on disk
 
-    def _coarse_path(self, frame: int) -> Path:
-        return self.coarse_folder / f"coarse_{frame:06d}.npz"
-
     def _coarse(self, frame: int) -> Coarse:
         """Return a frame's coarse field on the fine lattice."""
-        return read_coarse(self._coarse_path(frame)).resampled(self.lattice)
+        return self.job.read(frame).resampled(self.lattice)
 
     def _has_rows(self, frame: int) -> bool:
         return (self.paths.partial / f"rows_{frame:06d}.npy").exists()
@@ -423,7 +432,7 @@ def through_codec(table: MappingTable, previous: Rows | None, config: VideoConfi
     return trip
 
 
-def _claim_settings(path: Path, settings: dict[str, Any], what: str) -> None:
+def _claim_settings(path: Path, settings: dict[str, Any]) -> None:
     """Write down what a folder's files are made of, or make sure that it is the same. Raises `HoloreelError`."""
     if not path.exists():
         write_json(path, settings)
@@ -432,7 +441,7 @@ def _claim_settings(path: Path, settings: dict[str, Any], what: str) -> None:
     if changed:
         raise HoloreelError(
             f"{path.parent}: was made with another {', '.join(changed)}; pass the same settings, or delete the folder "
-            f"to make {what if what != '--resume' else 'everything'} anew."
+            "to make it anew."
         )
 
 
