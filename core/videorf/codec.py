@@ -107,10 +107,18 @@ def code_lumas(lumas: Sequence[NDArray[np.uint8]], qp: int, codec: str = "h264")
 
 
 def encode_video(
-    path: Path, lumas: Iterable[NDArray[np.uint8]], counts: Sequence[int], *, fps: float, qp: int, codec: str = "h264"
+    path: Path,
+    lumas: Iterable[NDArray[np.uint8]],
+    counts: Sequence[int],
+    *,
+    fps: float,
+    qp: int,
+    codec: str = "h264",
+    meaning: str = "",
 ) -> CodedVideo:
     """Write the lumas (H, W) of groups with `counts` frames each to `path`, atomically, and return where they lie.
 
+    `meaning` is the digest of what a reel makes of the pictures: the video's head carries it as its comment.
     Raises `HoloreelError` for an unknown codec, a QP out of range, or more or fewer lumas than the groups have.
     """
     check_rung(qp, codec)
@@ -118,7 +126,7 @@ def encode_video(
         raise ValueError("every group has at least one frame")
     firsts = np.concatenate(([0], np.cumsum(counts)[:-1])).tolist()
     with atomic_path(path) as temporary:
-        frames = _write(temporary, lumas, set(firsts), fps, qp, CODECS[codec])
+        frames = _write(temporary, lumas, set(firsts), fps, qp, CODECS[codec], meaning)
         if frames != sum(counts):
             raise HoloreelError(f"{path}: {frames} frames came for groups of {sum(counts)}; encode all of them.")
         head, spans = fragments(temporary)
@@ -140,6 +148,7 @@ def _write(
     fps: float,
     qp: int,
     codec: Codec,
+    meaning: str = "",
 ) -> int:
     import av
 
@@ -151,6 +160,7 @@ def _write(
     flags = {"movflags": "frag_keyframe+empty_moov+default_base_moof+skip_trailer"}
     target = str(file) if isinstance(file, Path) else file
     with av.open(target, "w", format="mp4", container_options=flags) as container:
+        container.metadata["comment"] = meaning
         stream: Any = None
         index = -1
         for index, luma in enumerate(lumas):
@@ -213,9 +223,12 @@ def _decode(data: bytes, picture: tuple[int, int] | None) -> Iterator[NDArray[np
 class FeatureVideo:
     """Any luma of a feature video, in any order; frames in order cost one decode each, the same one again none."""
 
-    def __init__(self, path: Path, video: CodedVideo, picture: tuple[int, int]) -> None:
-        """Open a video whose lumas are `picture` (height, width). Raises `HoloreelError` where the file is missing."""
-        self.path, self.video, self.picture = path, video, picture
+    def __init__(self, path: Path, video: CodedVideo, picture: tuple[int, int], meaning: str = "") -> None:
+        """Open a video whose lumas are `picture` (height, width), and whose head should carry `meaning`.
+
+        Raises `HoloreelError` where the file is missing.
+        """
+        self.path, self.video, self.picture, self.meaning = path, video, picture, meaning
         try:
             self.size = path.stat().st_size
         except OSError as error:
@@ -261,19 +274,41 @@ class FeatureVideo:
         return sum(group.frames for group in self.video.groups)
 
     def _start(self, group: CodedGroup) -> None:
+        self._group, self._next, self._latest = group, group.first, None
+        self._frames = _decode(self._head() + self._fragment(group), self.picture)
+
+    def check(self) -> Iterator[str]:
+        """Yield what is wrong with the file, a sentence each: nothing where every group can be played. Decodes
+        nothing.
+        """
+        for group in self.video.groups:
+            try:
+                self._head()
+                self._fragment(group)
+            except HoloreelError as error:
+                yield str(error)
+
+    def _head(self) -> bytes:
+        head = self._read(self.video.head)
+        if self.meaning.encode() not in head:
+            raise HoloreelError(
+                f"{self.path} was not encoded for the lattice, ranges, tiles and shading network that its reel says: "
+                "fetch both again."
+            )
+        return head
+
+    def _fragment(self, group: CodedGroup) -> bytes:
         if group.offset + group.size > self.size:
             last = group.first + group.frames - 1
             raise HoloreelError(
                 f"{self.path} is cut off: frames {group.first} to {last} are not whole; fetch the rest of it."
             )
-        head = self._read(self.video.head)
         part = self._read(Span(group.offset, group.size))
         if hashlib.sha256(part).hexdigest() != group.sha256:
             raise HoloreelError(
                 f"{self.path} is not the file that was encoded{self._suspicion()}: fetch the original file."
             )
-        self._group, self._next, self._latest = group, group.first, None
-        self._frames = _decode(head + part, self.picture)
+        return part
 
     def _read(self, span: Span) -> bytes:
         try:
@@ -293,4 +328,4 @@ class FeatureVideo:
                 limited = frame.color_range != FULL_RANGE
         except (av.error.FFmpegError, StopIteration, IndexError):
             return ", and does not decode"
-        return ": it was encoded again to a limited range" if limited else ": it was damaged or encoded again"
+        return ": it was encoded again to a limited range" if limited else ": it was damaged, cut, or encoded again"

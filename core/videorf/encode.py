@@ -4,7 +4,9 @@
 Everything is counted: video, tables, shading network, and the manifest with ranges and checksums.
 """
 
+import hashlib
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -17,7 +19,7 @@ from .mapping import MappingTable
 from .model import FieldVideo
 from .package import Rung, VideoReel, write_tables, write_video_reel
 from .quantize import Ranges
-from .shading import write_shading
+from .shading import shading_bytes, write_shading
 from .tiles import Tiling, tiling_of
 
 
@@ -70,13 +72,6 @@ def write_reel(
     for rung in rungs:
         check_rung(rung.qp, rung.codec)
     counts = [group.count for group in model.groups]
-    coded = []
-    for index, spec in enumerate(rungs):
-        name = _video_name(out, spec)
-        done = _progress(on_progress, index * model.frame_count, len(rungs) * model.frame_count)
-        lumas = lumas_of(model, ranges, tiling, done)
-        video = encode_video(out.with_name(name), lumas, counts, fps=model.fps, qp=spec.qp, codec=spec.codec)
-        coded.append(Rung(spec.qp, spec.codec, name, video))
     write_shading(out.with_suffix(".shading"), model.shading)
     reel = VideoReel(
         path=out,
@@ -89,9 +84,10 @@ def write_reel(
         layout=model.tables[0].layout,
         shading=model.shading.shape,
         shading_file=out.with_suffix(".shading").name,
+        shading_sha256=hashlib.sha256(shading_bytes(model.shading)).hexdigest(),
         tables_file=out.with_suffix(".tables").name,
         groups=write_tables(out.with_suffix(".tables"), model.tables, counts),
-        rungs=tuple(coded),
+        rungs=(),
         up=model.up,
         background=model.background,
         step=model.step,
@@ -99,6 +95,17 @@ def write_reel(
         files=files or {},
         provenance=model.provenance | (provenance or {}),
     )
+    coded = []
+    for index, spec in enumerate(rungs):
+        name = _video_name(out, spec)
+        done = _progress(on_progress, index * model.frame_count, len(rungs) * model.frame_count)
+        lumas = lumas_of(model, ranges, tiling, done)
+        qp, codec = spec
+        video = encode_video(
+            out.with_name(name), lumas, counts, fps=model.fps, qp=qp, codec=codec, meaning=reel.meaning
+        )
+        coded.append(Rung(qp, codec, name, video))
+    reel = replace(reel, rungs=tuple(coded))
     write_video_reel(reel)
     return reel
 

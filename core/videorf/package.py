@@ -7,7 +7,7 @@
      "march": {"step": 0.5, "transmittance_min": 0.0001},
      "ranges": {"low": [-8, ...], "high": [16, ...]},
      "image": {"profile": "universal", "width": 512, "height": 512, "columns": 4, "rows": 2, "layout": "blocks"},
-     "shading": {"file": "NAME.shading", "features": 7, "frequencies": 1, "hidden": 16},
+     "shading": {"file": "NAME.shading", "features": 7, "frequencies": 1, "hidden": 16, "sha256": "..."},
      "tables": {"file": "NAME.tables", "groups": [{"frames": 12, "vertices": 35463, "offset": 0, "size": 2100,
                 "sha256": "..."}]},
      "rungs": [{"qp": 20, "codec": "h264", "file": "NAME.qp20.mp4", "size": 440000, "head": 761,
@@ -21,11 +21,14 @@ of bytes in a file, so a static HTTP server with ranges is all that a stream nee
 
 import hashlib
 from bisect import bisect_right
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from itertools import accumulate
 from pathlib import Path
 from typing import Any, NamedTuple
+
+import numpy as np
 
 from ..errors import HoloreelError
 from ..files import atomic_path, read_json, write_json
@@ -35,7 +38,7 @@ from .mapping import LAYOUTS, Layout, MappingTable, check_size, table_from_bitma
 from .mp4 import Span
 from .occupancy import Lattice
 from .quantize import Ranges
-from .shading import Shading, ShadingShape, read_shading
+from .shading import Shading, ShadingShape, read_shading, shading_bytes
 from .tiles import Tiling, tiling_of
 
 KIND = "videorf"
@@ -80,6 +83,7 @@ class VideoReel:
     layout: Layout
     shading: ShadingShape
     shading_file: str
+    shading_sha256: str
     tables_file: str
     groups: tuple[TableEntry, ...]
     rungs: tuple[Rung, ...]
@@ -106,11 +110,33 @@ class VideoReel:
             raise HoloreelError(f"{self.path} has no frame {frame}: take 0 to {self.frame_count - 1}.")
         return bisect_right(self.firsts, frame) - 1
 
+    @property
+    def meaning(self) -> str:
+        """The SHA-256 of all that turns codes into a field: every video of a training carries it in its head.
+
+        It is that of these, little-endian, one after the other: lattice (3 uint32; 4 float64), ranges (C float64
+        lowest, C float64 highest), tiles (5 uint32: channels, height, width, columns, rows), the layout's name, the
+        shading network's shape (3 int32; -1 where it does not look at the direction) and the SHA-256 of its weights.
+        """
+        lattice, tiling, shape = self.lattice, self.tiling, self.shading
+        frequencies = -1 if shape.frequencies is None else shape.frequencies
+        parts = (
+            np.array(lattice.shape, "<u4"),
+            np.array((*lattice.lowest, lattice.spacing), "<f8"),
+            np.array((*self.ranges.low, *self.ranges.high), "<f8"),
+            np.array((tiling.channels, tiling.height, tiling.width, tiling.columns, tiling.rows), "<u4"),
+            self.layout.encode(),
+            np.array((shape.features, frequencies, shape.hidden), "<i4"),
+            bytes.fromhex(self.shading_sha256),
+        )
+        return hashlib.sha256(b"".join(bytes(part) for part in parts)).hexdigest()
+
     def video(self, rung: int = 0) -> FeatureVideo:
         """Open the video of a rung."""
         if not 0 <= rung < len(self.rungs):
             raise HoloreelError(f"{self.path} has no rung {rung}: take 0 to {len(self.rungs) - 1}.")
-        return FeatureVideo(self.path.parent / self.rungs[rung].file, self.rungs[rung].video, self.tiling.picture)
+        part = self.rungs[rung]
+        return FeatureVideo(self.path.parent / part.file, part.video, self.tiling.picture, self.meaning)
 
     def table(self, group: int) -> MappingTable:
         """Read a group's table. Raises `HoloreelError` where it is missing, damaged, or not of the size it should
@@ -134,9 +160,31 @@ class VideoReel:
             )
         return table
 
+    def problems(self) -> list[str]:
+        """Return what is wrong with the files beside the reel, a sentence each; nothing where all of it can be played.
+
+        Everything is read and nothing decoded.
+        """
+        found = []
+        checks: list[Callable[[], object]] = [self.shade]
+        checks += [partial(self.table, group) for group in range(len(self.groups))]
+        checks += [
+            partial(lambda rung: found.extend(self.video(rung).check()), rung) for rung in range(len(self.rungs))
+        ]
+        for check in checks:
+            try:
+                check()
+            except HoloreelError as error:
+                found.append(str(error))
+        return list(dict.fromkeys(found))
+
     def shade(self) -> Shading:
-        """Read the shading network."""
-        return read_shading(self.path.parent / self.shading_file, self.shading)
+        """Read the shading network. Raises `HoloreelError` where it is missing or another one than the reel's."""
+        path = self.path.parent / self.shading_file
+        shading = read_shading(path, self.shading)
+        if hashlib.sha256(shading_bytes(shading)).hexdigest() != self.shading_sha256:
+            raise HoloreelError(f"{path} is damaged or of another training: fetch it again.")
+        return shading
 
 
 def write_tables(path: str | Path, tables: Sequence[MappingTable], frames: Sequence[int]) -> tuple[TableEntry, ...]:
@@ -174,7 +222,7 @@ def write_video_reel(reel: VideoReel) -> None:
             "rows": tiling.rows,
             "layout": reel.layout,
         },
-        "shading": {"file": reel.shading_file, **vars(reel.shading)},
+        "shading": {"file": reel.shading_file, **vars(reel.shading), "sha256": reel.shading_sha256},
         "tables": {"file": reel.tables_file, "groups": [group._asdict() for group in reel.groups]},
         "rungs": [_rung_object(rung) for rung in reel.rungs],
         "files": reel.files,
@@ -242,6 +290,7 @@ def parse_video_reel(path: Path, manifest: dict[str, Any]) -> VideoReel:
         layout=layout,
         shading=ShadingShape(features, frequencies, hidden),
         shading_file=shading.file("file"),
+        shading_sha256=shading.digest("sha256"),
         tables_file=tables.file("file"),
         groups=groups,
         rungs=_parse_rungs(top, groups),

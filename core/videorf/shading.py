@@ -85,9 +85,14 @@ def encode_direction(directions: NDArray, shape: ShadingShape) -> NDArray[np.flo
     return np.concatenate((directions, *waves), -1)
 
 
+def shading_bytes(shading: Shading) -> bytes:
+    """Return what the file of Φ's weights holds."""
+    return b"".join(part.astype("<f4").tobytes() for layer in shading.layers for part in layer)
+
+
 def write_shading(path: str | Path, shading: Shading) -> int:
     """Write Φ's weights, atomically; returns the file's size in bytes."""
-    data = b"".join(part.astype("<f4").tobytes() for layer in shading.layers for part in layer)
+    data = shading_bytes(shading)
     with atomic_path(path) as temporary:
         temporary.write_bytes(data)
     return len(data)

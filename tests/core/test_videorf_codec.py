@@ -167,7 +167,7 @@ def encoded_again(path: Path, source: Path, limited: bool) -> None:
 
 def test_videos_encoded_again_are_refused_by_name(video, tmp_path):
     path, coded, _ = video
-    for limited, message in ((True, "encoded again to a limited range"), (False, "damaged or encoded again")):
+    for limited, message in ((True, "encoded again to a limited range"), (False, "damaged, cut, or encoded again")):
         other = tmp_path / "again.mp4"
         encoded_again(other, path, limited)
         other.write_bytes(other.read_bytes() + bytes(coded.size))  # long enough to hold every fragment
@@ -206,6 +206,39 @@ def test_videos_that_are_not_as_their_reel_says_are_refused(video, tmp_path):
     part = limited.read_bytes()[spans[0].offset :][: spans[0].size]
     lie = first._replace(offset=spans[0].offset, size=spans[0].size, sha256=hashlib.sha256(part).hexdigest())
     refused(coded._replace(head=head, groups=(lie,)), PICTURE, "of limited range", limited)
+
+
+def without_packet(path: Path, source: Path, gone: int) -> None:
+    """Copy a video, fragment by fragment, without one of its packets."""
+    import av
+
+    flags = {"movflags": "frag_keyframe+empty_moov+default_base_moof+skip_trailer"}
+    with av.open(str(source)) as old, av.open(str(path), "w", format="mp4", container_options=flags) as new:
+        stream = new.add_stream_from_template(old.streams.video[0])
+        packets = [packet for packet in old.demux(video=0) if packet.dts is not None]
+        for packet in packets[:gone] + packets[gone + 1 :]:
+            packet.stream = stream
+            new.mux(packet)
+
+
+def test_groups_cut_in_the_middle_are_refused(video, tmp_path):
+    path, coded, _ = video
+    cut = tmp_path / "cut.mp4"
+    for gone, message in ((3, "group from frame 0 on has 3 frames"), (0, "group from frame 0 on has 0 frames")):
+        without_packet(cut, path, gone)
+        cut.write_bytes(cut.read_bytes() + bytes(coded.size))
+        with pytest.raises(HoloreelError, match="damaged, cut, or encoded again"):
+            FeatureVideo(cut, coded, PICTURE).luma(0)
+        # The manifest of somebody who only wrote new checksums.
+        without_packet(cut, path, gone)
+        head, spans = fragments(cut)
+        first = coded.groups[0]._replace(
+            offset=spans[0].offset,
+            size=spans[0].size,
+            sha256=hashlib.sha256(cut.read_bytes()[spans[0].offset :][: spans[0].size]).hexdigest(),
+        )
+        with pytest.raises(HoloreelError, match=message):
+            FeatureVideo(cut, coded._replace(head=head, groups=(first,)), PICTURE).luma(3)
 
 
 def test_encoding_refuses_what_makes_no_video(tmp_path):

@@ -3,82 +3,26 @@
 
 import copy
 import json
+import shutil
 import subprocess
 import sys
 
 import numpy as np
 import pytest
 from holoreel.core.errors import HoloreelError
-from holoreel.core.videorf.codec import encode_video
-from holoreel.core.videorf.grouping import group_frames
-from holoreel.core.videorf.mapping import build_table
-from holoreel.core.videorf.occupancy import Lattice
-from holoreel.core.videorf.package import (
-    Rung,
-    VideoReel,
-    parse_video_reel,
-    read_video_reel,
-    write_tables,
-    write_video_reel,
-)
-from holoreel.core.videorf.quantize import fit_ranges
-from holoreel.core.videorf.shading import Shading, ShadingShape, write_shading
-from holoreel.core.videorf.tiles import tiling_of
+from holoreel.core.videorf.encode import RungSpec, write_reel
+from holoreel.core.videorf.package import parse_video_reel, read_video_reel
 
-CHANNELS = 8
-SHAPE = (14, 12, 13)
+from .videorf_model import ball_model
 
 
 @pytest.fixture(scope="module")
 def packed(tmp_path_factory):
-    """A reel of five frames in groups, and the rows (N, C) of each frame, smooth in space as trained ones are."""
-    folder = tmp_path_factory.mktemp("package")
-    grid = np.stack(np.meshgrid(*[np.linspace(-1, 1, edge) for edge in SHAPE], indexing="ij"), -1)
-    frames = [np.linalg.norm(grid - [0.5 * t / 4, 0, 0], axis=-1) < 0.62 for t in range(5)]
-    groups = list(group_frames(frames, int(1.35 * frames[0].sum())))
-    assert len(groups) > 1
-    tables = [build_table(group.union, (32, 32)) for group in groups]
-    rows = []
-    for group, table in zip(groups, tables, strict=True):
-        place = grid[tuple(table.vertices.T)]
-        for t in range(group.first, group.first + group.count):
-            channels = [np.sin((1 + c / 3) * place[:, c % 3] + t / 4) * (1 + c) for c in range(CHANNELS)]
-            rows.append(np.stack(channels, 1))
-    ranges = fit_ranges(rows)
-    tiling = tiling_of("universal", CHANNELS, 32, 32)
-    counts = [group.count for group in groups]
-    owner = [table for table, count in zip(tables, counts, strict=True) for _ in range(count)]
-    empty = ranges.encode(ranges.empty)
-    lumas = [tiling.pack(table.to_image(ranges.encode(part), empty)) for table, part in zip(owner, rows, strict=True)]
-    rungs = []
-    for qp in (8, 30):
-        video = encode_video(folder / f"a.qp{qp}.mp4", lumas, counts, fps=24, qp=qp)
-        rungs.append(Rung(qp, "h264", f"a.qp{qp}.mp4", video))
-    shape = ShadingShape(CHANNELS - 1, 1, 4)
-    random = np.random.default_rng(0)
-    layers = [(random.normal(size=(o, i)), random.normal(size=o)) for o, i in shape.layers]
-    layers = tuple((matrix.astype(np.float32), bias.astype(np.float32)) for matrix, bias in layers)
-    write_shading(folder / "a.shading", Shading(shape, layers))
-    reel = VideoReel(
-        folder / "a.reel",
-        fps=24.0,
-        frame_start=101,
-        lattice=Lattice(SHAPE, (-1.0, -1.0, -1.0), 2 / 13),
-        ranges=ranges,
-        tiling=tiling,
-        profile="universal",
-        layout="blocks",
-        shading=shape,
-        shading_file="a.shading",
-        tables_file="a.tables",
-        groups=write_tables(folder / "a.tables", tables, counts),
-        rungs=tuple(rungs),
-        up="Z",
-        files={"metrics": "metrics.json"},
-        provenance={"made": "by a test"},
-    )
-    write_video_reel(reel)
-    return reel, tables, rows
+    """A reel of five frames in groups, its tables and the rows (N, C) of each frame."""
+    model = ball_model()
+    path = tmp_path_factory.mktemp("package") / "a.reel"
+    reel = write_reel(model, path, [RungSpec(8), RungSpec(30)], files={"metrics": "metrics.json"})
+    return reel, model.tables, [model.rows(frame) for frame in range(5)]
 
 
 def test_reels_come_back_as_they_were(packed):
@@ -136,6 +80,63 @@ def test_payloads_that_disagree_are_refused(packed, tmp_path):
         opened(lambda m: m["shading"].update(hidden=5)).shade()
 
 
+def copied(reel, folder):
+    for path in reel.path.parent.iterdir():
+        shutil.copy(path, folder / path.name)
+    return folder / "a.reel"
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda m: m["ranges"]["high"].__setitem__(3, m["ranges"]["high"][3] + 1e-3),
+        lambda m: m["ranges"]["low"].__setitem__(0, -8.5),
+        lambda m: m["lattice"].update(spacing=0.1),
+        lambda m: m["lattice"].update(lowest=[0, 0, 0]),
+        lambda m: m["image"].update(layout="macroblocks"),
+        lambda m: m["shading"].update(sha256="0" * 64),
+    ],
+    ids=["range", "empty", "spacing", "place", "layout", "network"],
+)
+def test_videos_of_another_training_are_refused(packed, tmp_path, change):
+    """A stream carries what it means: a manifest that says something else is not believed."""
+    path = copied(packed[0], tmp_path)
+    manifest = json.loads(path.read_text())
+    change(manifest)
+    path.write_text(json.dumps(manifest))
+    reel = read_video_reel(path)
+    with pytest.raises(HoloreelError, match=r"a\.qp8\.mp4 was not encoded for the lattice, ranges"):
+        reel.video().luma(0)
+    assert any("a.qp8.mp4" in problem for problem in reel.problems())
+
+
+def test_networks_of_another_training_are_refused(packed, tmp_path):
+    path = copied(packed[0], tmp_path)
+    data = bytearray((tmp_path / "a.shading").read_bytes())
+    data[6] ^= 1
+    (tmp_path / "a.shading").write_bytes(data)
+    with pytest.raises(HoloreelError, match="damaged or of another training"):
+        read_video_reel(path).shade()
+
+
+def test_problems_name_what_cannot_be_played_and_nothing_else(packed, tmp_path):
+    reel = read_video_reel(copied(packed[0], tmp_path))
+    assert reel.problems() == []
+    last = reel.rungs[0].video.groups[-1]
+    video = tmp_path / "a.qp8.mp4"
+    video.write_bytes(video.read_bytes()[: last.offset + last.size // 2])
+    (tmp_path / "a.qp30.mp4").unlink()
+    tables = bytearray((tmp_path / "a.tables").read_bytes())
+    tables[1] ^= 255
+    (tmp_path / "a.tables").write_bytes(tables)
+    named = ("damaged at group 0", f"frames {last.first} to 4 are not whole", "a.qp30.mp4 cannot be read")
+    problems = reel.problems()
+    assert len(problems) == len(named)
+    assert all(name in problem for name, problem in zip(named, problems, strict=True))
+    assert reel.video(0).luma(0).shape == reel.tiling.picture
+    assert reel.table(1).count == reel.groups[1].vertices
+
+
 CHANGES = [
     ("kind", "spacetime_gaussians"),
     ("version", 0),
@@ -156,7 +157,7 @@ CHANGES = [
     ("march.transmittance_min", 1),
     ("ranges.low", [0] * 7),
     ("ranges.high", [-99] * 8),
-    ("image.width", 40),
+    ("image.width", 24),
     ("image.width", 10**9),
     ("image.columns", 5),
     ("image.profile", "huge"),
@@ -165,6 +166,7 @@ CHANGES = [
     ("shading.hidden", 10**9),
     ("shading.frequencies", 9),
     ("shading.file", "../a.shading"),
+    ("shading.sha256", "f" * 63),
     ("shading.file", "C:a.shading"),
     ("tables.file", "/etc/passwd"),
     ("tables.groups", []),
