@@ -165,7 +165,7 @@ class VideoReel:
 
         Everything is read and nothing decoded.
         """
-        found = []
+        found: list[str] = []
         checks: list[Callable[[], object]] = [self.shade]
         checks += [partial(self.table, group) for group in range(len(self.groups))]
         checks += [
