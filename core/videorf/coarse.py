@@ -79,17 +79,18 @@ def resample(values: NDArray, source: Lattice, target: Lattice, fill: float) -> 
     Both lattices have the world's axes, so that the mean is one of means along each axis.
     """
     result = np.asarray(values, np.float32)
+    inside = np.ones(target.shape, bool)
     for axis in range(3):
         count = source.shape[axis]
         place = target.lowest[axis] + target.spacing * np.arange(target.shape[axis]) - source.lowest[axis]
         place /= source.spacing
         cell = np.clip(np.floor(place), 0, count - 2).astype(int)
         part = (place - cell).astype(np.float32).reshape(-1, *[1] * (result.ndim - 1 - axis))
-        mean = np.take(result, cell, axis) * (1 - part) + np.take(result, cell + 1, axis) * part
-        beyond = (place < -1e-6) | (place > count - 1 + 1e-6)
-        np.moveaxis(mean, axis, 0)[beyond] = fill
-        result = mean
-    return np.ascontiguousarray(result)
+        result = np.take(result, cell, axis) * (1 - part) + np.take(result, cell + 1, axis) * part
+        within = (place >= -1e-6) & (place <= count - 1 + 1e-6)
+        inside &= within.reshape(-1, *[1] * (2 - axis))
+    result[~inside] = fill
+    return result
 
 
 def occupancy_of(
@@ -114,21 +115,29 @@ def read_coarse(path: str | Path) -> Coarse:
     path = Path(path)
     try:
         with zipfile.ZipFile(path) as archive:
-            shapes = {name: _header(archive, name) for name in ("place", "density", "color", "weights")}
-            grid = shapes["density"][0]
-            wanted = {"place": (4,), "density": grid, "color": (*grid, 3), "weights": grid}
-            for name, shape in wanted.items():
-                if shapes[name] != (shape, np.float64 if name == "place" else np.float32):
-                    raise ValueError(f"its {name} is {shapes[name][0]} of {shapes[name][1]}")
-            place = _array(archive, "place").tolist()
-            if len(grid) != 3:
-                raise ValueError(f"its density is {grid}")
-            lattice = Lattice((grid[0], grid[1], grid[2]), (place[0], place[1], place[2]), place[3])
-            arrays = [_array(archive, name) for name in ("density", "color", "weights")]
-    except (OSError, ValueError, KeyError, EOFError, NotImplementedError, zipfile.BadZipFile, zlib.error) as error:
-        raise HoloreelError(f"{path} is no coarse field ({error}): delete it and train it again.") from error
+            return _read(archive)
+    except (OSError, EOFError, NotImplementedError, zipfile.BadZipFile, zlib.error) as error:
+        raise HoloreelError(f"{path} cannot be read ({error}): delete it and train it again.") from error
+    except (HoloreelError, ValueError, KeyError) as error:
+        reason = str(error).rstrip(".")
+        raise HoloreelError(f"{path} is no coarse field ({reason}): delete it and train it again.") from error
+
+
+def _read(archive: zipfile.ZipFile) -> Coarse:
+    """Read the arrays, none before its header is known to be sound; a ValueError says what is wrong."""
+    shapes = {name: _header(archive, name) for name in ("place", "density", "color", "weights")}
+    grid = shapes["density"][0]
+    wanted = {"place": (4,), "density": grid, "color": (*grid, 3), "weights": grid}
+    for name, shape in wanted.items():
+        if shapes[name] != (shape, np.float64 if name == "place" else np.float32):
+            raise ValueError(f"its {name} is {shapes[name][0]} of {shapes[name][1]}")
+    if len(grid) != 3:
+        raise ValueError(f"its density is {grid}")
+    *lowest, spacing = _array(archive, "place").tolist()
+    lattice = Lattice((grid[0], grid[1], grid[2]), (lowest[0], lowest[1], lowest[2]), spacing)
+    arrays = [_array(archive, name) for name in ("density", "color", "weights")]
     if not all(np.isfinite(array).all() for array in arrays):
-        raise HoloreelError(f"{path} holds values that are not finite: delete it and train it again.")
+        raise ValueError("it holds values that are not finite")
     return Coarse(lattice, *arrays)
 
 
@@ -235,7 +244,7 @@ def _optimized(
         (gradient,) = torch.autograd.grad(photometric + config.entropy * unsure, leaf)
         optimizer.step(gradient, rates * config.final_rate ** (iteration / config.iterations), spatial=config.smooth)
         if on_progress and ((iteration + 1) % REPORT_EVERY == 0 or iteration + 1 == config.iterations):
-            on_progress(iteration + 1, -10 * math.log10(max(float(photometric) / 3, 1e-10)))
+            on_progress(iteration + 1, -10 * math.log10(max(photometric.item() / 3, 1e-10)))
     return rows
 
 

@@ -2,7 +2,6 @@
 """Training rays, bounds and the visual hull, against spheres whose silhouettes are known exactly."""
 
 from itertools import pairwise
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -15,48 +14,9 @@ from holoreel.core.videorf.hull import carve, visual_hull
 from holoreel.core.videorf.occupancy import Lattice
 from holoreel.core.videorf.views import FrameViews, subject_bounds
 
-CENTER = np.array([0.3, -0.2, 0.5])
-RADIUS = 0.7
-ASIDE = np.array([0.1, 0.05, 0])
+from .videorf_ball import CENTER, RADIUS, SIZE, alpha_of, around, ball_capture, distances, dome
+
 MOVED = np.array([0.2, 0, 0.1])
-SIZE = 48
-
-
-def dome(count=12, distance=3.2, lens=False):
-    """Cameras all around, looking near the ball but not at its middle."""
-    cameras = {}
-    for index in range(count):
-        height = -0.8 + 1.6 * index / (count - 1)
-        angle = 2.4 * index
-        across = np.sqrt(1 - height**2)
-        eye = CENTER + distance * np.array([across * np.cos(angle), across * np.sin(angle), height])
-        camera = Camera.look_at(eye, CENTER + ASIDE, width=SIZE + 8, height=SIZE, fx=62, name=f"cam{index:02d}")
-        if lens:
-            camera = Camera(**{**vars(camera), "model": "OPENCV", "distortion": (-0.08, 0.01, 0, 0)})
-        cameras[camera.name] = camera
-    return cameras
-
-
-def alpha_of(camera, center=CENTER, radius=RADIUS):
-    """Where the rays of a camera meet the ball, (H, W) bool."""
-    origins, directions = camera.rays()
-    to_center = center - origins
-    along = (to_center * directions).sum(1)
-    return (((to_center**2).sum(1) - along**2) < radius**2).reshape(camera.height, camera.width)
-
-
-def ball_capture(folder: Path, frames=1, cameras=None, centers=None, **fields) -> Capture:
-    """A ball in front of cameras, cut out by alpha; its red is the column, its green the row, its blue the camera."""
-    cameras = cameras or dome()
-    images = {}
-    for frame in range(frames):
-        for index, (name, camera) in enumerate(cameras.items()):
-            rows, columns = np.mgrid[: camera.height, : camera.width]
-            alpha = alpha_of(camera, CENTER if centers is None else centers[frame])
-            picture = np.stack((columns, rows, np.full_like(rows, index), 255 * alpha), -1) / 255
-            images[name, frame] = folder / name / f"{frame:04d}.png"
-            write_png(images[name, frame], picture)
-    return Capture(cameras, images, frames, source=folder / "transforms.json", **fields)
 
 
 def test_pool_is_the_pixels_near_the_subject(tmp_path):
@@ -137,15 +97,6 @@ def test_masks_that_enclose_nothing(tmp_path):
         subject_bounds(Capture(cameras | {"cam02": turned}, capture.images, source=capture.source))
     with pytest.raises(HoloreelError, match="give the subject's bounds"):  # all from one side: no end to the far one
         subject_bounds(ball_capture(tmp_path / "one", cameras=dict(list(cameras.items())[:1])))
-
-
-def around(edge=32):
-    return Lattice.around(CENTER - RADIUS, CENTER + RADIUS, edge, margin=5)
-
-
-def distances(lattice):
-    vertices = np.stack(np.meshgrid(*map(np.arange, lattice.shape), indexing="ij"), -1)
-    return np.linalg.norm(lattice.positions(vertices) - CENTER, axis=-1)
 
 
 def test_hull_holds_every_cell_of_the_subject(tmp_path):
