@@ -234,8 +234,8 @@ def test_weights_are_those_of_the_samples(ball, tmp_path):
     parts = [torch.cat((lit[:, :1], lit[:, 1 + at : 15 + at]), 1) for at in (0, 14)]
     summed = torch.cat([reference.march(field, part, rays).features.sum(0) for part in parts])
     assert weights.numpy() == pytest.approx(summed[:27].numpy(), rel=1e-3)
-    few = ray_weights(Volume(field), rows, views, CoarseConfig(weight_rays=len(views) // 4), 0)
-    assert float(few.sum() / weights.sum()) == pytest.approx(0.25, rel=0.1)
+    few = ray_weights(Volume(field), rows, views, CoarseConfig(weight_rays=len(views) // 2), 0)
+    assert float(few.sum() / weights.sum()) == pytest.approx(0.5, rel=0.2)
 
 
 def test_training_hangs_on_the_seed_alone(ball):
