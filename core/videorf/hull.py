@@ -43,7 +43,7 @@ def visual_hull(views: "FrameViews", lattice: Lattice, misses: int = 0, reach: f
     blind = [name for name, seen in views.masks.items() if not seen.mask.any()]
     cause = f" (the masks of {', '.join(blind)} are empty)" if len(blind) > misses else ""
     raise HoloreelError(
-        f"The masks of frame {views.frame} leave no room for the subject in the box {np.round(lattice.lowest, 3)} to "
+        f"The masks of frame {views.number} leave no room for the subject in the box {np.round(lattice.lowest, 3)} to "
         f"{np.round(lattice.highest, 3)}{cause}: mend the subject's bounds, the calibration or the masks, or let some "
         "masks miss it."
     )

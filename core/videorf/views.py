@@ -45,7 +45,7 @@ class FrameViews:
         if border < 0:
             raise ValueError("border must be 0 or more")
         names = [name for name in capture.camera_names(split) if (name, frame) in capture.images]
-        self.frame = frame
+        self.number = capture.frame_start + frame  # on the timeline, for messages
         self.masks: dict[str, SeenMask] = {}
         parts = []
         for name in names:
@@ -54,7 +54,7 @@ class FrameViews:
             parts.append(_rays_near(self.masks[name], rgba, border))
         if not any(len(part.rgba) for part in parts):
             raise HoloreelError(
-                f"{capture.source}: no camera's mask shows anything in frame {frame}: give masks that are white where "
+                f"{capture.source}: no camera's mask shows anything in frame {self.number}: give masks that are white where "
                 "the subject is, or leave the frame out."
             )
         self.centers = torch.stack([part.origins for part in parts])

@@ -69,7 +69,7 @@ def test_rays_through_a_lens(tmp_path):
 
 def test_no_mask_shows_anything(tmp_path):
     capture = ball_capture(tmp_path, cameras=dome(3), centers=[[90, 90, 90]])
-    with pytest.raises(HoloreelError, match=r"no camera's mask shows anything in frame 0"):
+    with pytest.raises(HoloreelError, match=r"no camera's mask shows anything in frame 1"):
         FrameViews(capture, 0)
 
 
@@ -131,9 +131,9 @@ def test_misses_forgive_bad_masks(tmp_path):
     for name in ("cam03", "cam08"):
         write_png(capture.images[name, 0], np.zeros((SIZE, SIZE + 8, 4)))
     views, lattice = FrameViews(capture, 0), around()
-    with pytest.raises(HoloreelError, match=r"frame 0 .*cam03, cam08 are empty"):
+    with pytest.raises(HoloreelError, match=r"frame 1 .*cam03, cam08 are empty"):
         visual_hull(views, lattice)
-    with pytest.raises(HoloreelError, match="frame 0"):
+    with pytest.raises(HoloreelError, match="frame 1"):
         visual_hull(views, lattice, misses=1)
     hull = visual_hull(views, lattice, misses=2)
     assert hull[distances(lattice) < RADIUS + lattice.spacing].all()
@@ -169,3 +169,10 @@ def test_hull_off_the_subject(tmp_path):
     views = FrameViews(ball_capture(tmp_path), 0)
     with pytest.raises(HoloreelError, match="bounds, the calibration or the masks"):
         visual_hull(views, Lattice.around(CENTER + 1.5, CENTER + 2, 16))
+
+
+def test_pictures_without_masks(tmp_path):
+    path = tmp_path / "plain.png"
+    write_png(path, np.ones((SIZE, SIZE + 8, 3)))
+    with pytest.raises(HoloreelError, match=r"cam01.*mask"):
+        FrameViews(Capture({"cam01": dome(3)["cam01"]}, {("cam01", 0): path}), 0)
