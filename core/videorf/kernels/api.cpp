@@ -48,21 +48,6 @@ void check(const VideorfRays& rays) {
         throw std::invalid_argument("the least transmittance must lie in 0 ... 1");
 }
 
-// Sorts a chunk's records by shard, stably; those that touch several are named several times.
-void sort_by_shard(const Volume& volume, Chunk& chunk) {
-    uint32_t next[kShards + 1] = {};
-    const auto each = [&](auto&& visit) {
-        for (uint32_t i = 0; i < chunk.records.size(); i++)
-            for (uint32_t mask = volume.shards[chunk.records[i].corner / kBrickVertices]; mask; mask &= mask - 1)
-                visit(__builtin_ctz(mask), i);
-    };
-    each([&](int shard, uint32_t) { next[shard + 1]++; });
-    for (int shard = 0; shard < kShards; shard++) next[shard + 1] += next[shard];
-    std::memcpy(chunk.begin, next, sizeof next);
-    chunk.order.resize(next[kShards]);
-    each([&](int shard, uint32_t i) { chunk.order[next[shard]++] = i; });
-}
-
 template <class Work> int guarded(Work work) {
     try {
         std::lock_guard<std::mutex> lock(call_mutex);
@@ -82,6 +67,8 @@ struct Tape {
     int channels;
     int64_t count;  // chunks in use
     std::vector<Chunk> chunks;
+    std::vector<Scattered> sorted;
+    std::vector<uint32_t> next, begins;
 };
 
 namespace {
@@ -101,6 +88,35 @@ std::unique_ptr<Tape> take_tape(const Volume* volume, int channels, int64_t coun
     tape->count = count;
     if (tape->chunks.size() < size_t(count)) tape->chunks.resize(count);
     return tape;
+}
+
+// Makes room for the samples in the order of their bricks: `begins` says where those of each brick begin. Returns per part of
+// the chunks where it puts its own.
+std::vector<uint32_t*> count_bricks(Tape& tape, int64_t parts) {
+    const size_t bricks = tape.volume->occupied.size();
+    tape.next.assign(parts * bricks, 0);
+    std::vector<uint32_t*> next(parts);
+    for (int64_t part = 0; part < parts; part++) next[part] = tape.next.data() + part * bricks;
+    pool().run(parts, [&](int64_t part) {
+        for (int64_t run = part * tape.count / parts; run < (part + 1) * tape.count / parts; run++) {
+            const Chunk& chunk = tape.chunks[run];
+            for (size_t i = 0; i < chunk.used; i++) next[part][chunk.corner[i] / kBrickVertices]++;
+        }
+    });
+    tape.begins.resize(bricks + 1);
+    uint64_t sum = 0;
+    for (size_t brick = 0; brick < bricks; brick++) {
+        tape.begins[brick] = static_cast<uint32_t>(sum);
+        for (int64_t part = 0; part < parts; part++) {
+            const uint32_t count = next[part][brick];
+            next[part][brick] = static_cast<uint32_t>(sum);
+            sum += count;
+        }
+    }
+    if (sum > UINT32_MAX) throw std::invalid_argument("the rays take more than 2^32 samples");
+    tape.begins[bricks] = static_cast<uint32_t>(sum);
+    if (tape.sorted.size() < sum) tape.sorted.resize(sum);
+    return next;
 }
 
 }  // namespace
@@ -146,7 +162,6 @@ VIDEORF_API int videorf_forward(const Volume* volume, const float* table, int32_
         pool().run(runs, [&](int64_t run) {
             Chunk* chunk = taken ? &taken->chunks[run] : nullptr;
             sum += kernel.forward(march, run * kRun, std::min(rays->count, (run + 1) * kRun), chunk);
-            if (chunk) sort_by_shard(*volume, *chunk);
         });
         *samples = sum;
         if (tape) *tape = taken.release();
@@ -154,19 +169,23 @@ VIDEORF_API int videorf_forward(const Volume* volume, const float* table, int32_
 }
 
 // `table_gradient` (rows, C) is overwritten; its last row, which empty vertices share, is 0. Its bits do not depend on the
-// number of threads: runs of rays are of a fixed length, and each run of rows is filled by one thread in the order of the rays.
-// A tape serves once.
+// number of threads: samples are sorted by brick, and in a brick by ray; bricks are added one after the other, those that share
+// vertices never at once. A tape serves once.
 VIDEORF_API int videorf_backward(Tape* tape, const VideorfImageGradients* gradients, float* table_gradient) {
     return guarded([&] {
         const Volume& volume = *tape->volume;
         const MarchKernels& kernel = kernels(tape->channels);
+        const int64_t parts = std::min<int64_t>(tape->count, 4 * get_threads());
+        std::vector<uint32_t*> next = count_bricks(*tape, parts);
         std::memset(table_gradient, 0, sizeof(float) * volume.rows * tape->channels);
-        pool().run(tape->count, [&](int64_t run) {
-            kernel.backward(*gradients, volume.spacing, run * kRun, tape->chunks[run]);
+        pool().run(parts, [&](int64_t part) {
+            for (int64_t run = part * tape->count / parts; run < (part + 1) * tape->count / parts; run++)
+                kernel.backward(*gradients, volume.spacing, run * kRun, tape->chunks[run], next[part], tape->sorted.data());
         });
-        pool().run(kShards, [&](int64_t shard) {
-            kernel.scatter(volume, *gradients, static_cast<int>(shard), tape->chunks.data(), tape->count, table_gradient);
-        });
+        for (const std::vector<Column>& columns : volume.columns)
+            pool().run(static_cast<int64_t>(columns.size()), [&](int64_t i) {
+                kernel.scatter(volume, *gradients, columns[i], tape->sorted.data(), tape->begins.data(), table_gradient);
+            });
     });
 }
 

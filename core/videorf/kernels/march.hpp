@@ -2,6 +2,7 @@
 // What a width's translation unit offers: the march of a run of rays, for tables of 4, 8 or 16 channels.
 #pragma once
 
+#include <cstddef>
 #include <cstdint>
 #include <vector>
 
@@ -12,25 +13,26 @@ namespace videorf {
 
 constexpr int kBatch = 8;  // samples that are taken at once
 
-// What the forward pass writes down of a sample, so that the backward pass need not march again.
-struct Record {
-    int32_t corner;      // the cell's lowest in Volume::rows_of
-    float x, y, z;       // place in the cell
-    float weight;        // times the gradient of the ray's features gives that of the sample's features
-    float distance;      // from the ray's origin, in spacings
-    float after;         // the transmittance behind the sample
-    float slope;         // of -log(1 - alpha) over the density; the backward pass puts the density's gradient here
+// What the forward pass writes down of the samples of a run of rays, so that the backward pass need not march again.
+struct Chunk {
+    size_t used = 0;                // samples written down
+    std::vector<int32_t> corner;    // per sample its cell's lowest in Volume::rows_of
+    std::vector<float> x, y, z;     // place in the cell
+    std::vector<float> weight;      // times the gradient of the ray's features gives that of the sample's features
+    std::vector<float> distance;    // from the ray's origin, in spacings
+    std::vector<float> after;       // the transmittance behind the sample
+    std::vector<float> slope;       // of -log(1 - alpha) over the density
+    std::vector<float> rows;        // the table's row at the sample, C channels
+    std::vector<uint32_t> ends;     // per ray where its samples end
+    std::vector<float> left;        // per ray its transmittance at the end
 };
 
-// The records of a run of rays, and which of them touch each shard, in the order of the rays.
-struct Chunk {
-    std::vector<Record> records;
-    std::vector<float> rows;      // the table's row at each record, C channels
-    std::vector<uint32_t> ends;   // per ray where its records end
-    std::vector<float> left;      // per ray its transmittance at the end
-    std::vector<int32_t> rays;    // per record its ray
-    std::vector<uint32_t> order;
-    uint32_t begin[kShards + 1];
+// A sample with its gradient, sorted by brick.
+struct Scattered {
+    int32_t ray, corner;  // the latter within its brick
+    float x, y, z, weight;
+    float density;  // the gradient of the sample's raw density
+    float unused;
 };
 
 struct March {
@@ -44,10 +46,12 @@ struct MarchKernels {
     int lanes;
     // Marches rays first ... last - 1, writing down in `chunk` if there is one; returns the number of samples taken.
     int64_t (*forward)(const March&, int64_t first, int64_t last, Chunk* chunk);
-    // Puts the gradient of every record's density in its place. `first` is the chunk's first ray.
-    void (*backward)(const VideorfImageGradients&, double spacing, int64_t first, Chunk& chunk);
-    // Adds one shard of the chunks' records to the table's gradient, chunk by chunk.
-    void (*scatter)(const Volume&, const VideorfImageGradients&, int shard, const Chunk* chunks, int64_t count,
+    // Writes the samples of a chunk, whose first ray is `first`, to the places that `next` gives for their bricks, and moves
+    // those on.
+    void (*backward)(const VideorfImageGradients&, double spacing, int64_t first, const Chunk& chunk, uint32_t* next,
+                     Scattered* sorted);
+    // Adds the samples of a column's bricks, which begin where `begins` says, to the table's gradient.
+    void (*scatter)(const Volume&, const VideorfImageGradients&, Column, const Scattered* sorted, const uint32_t* begins,
                     float* gradient);
 };
 

@@ -36,11 +36,46 @@ template <int C> HOLOREEL_INLINE float sum_row(typename RowOf<C>::type row) {
     return sum;
 }
 
-// Up to kBatch samples, those in occupied cells only.
+typedef float Lane8 __attribute__((vector_size(32)));
+typedef int32_t Mask8 __attribute__((vector_size(32)));
+static_assert(sizeof(Lane8) == kBatch * sizeof(float), "a batch fills one vector");
+
+HOLOREEL_INLINE Lane8 broadcast(float value) { return value - Lane8{}; }
+HOLOREEL_INLINE int count_true(Mask8 mask) {
+#if HOLOREEL_LANES == 8
+    return __builtin_popcount(_mm256_movemask_ps(reinterpret_cast<__m256>(mask)));
+#else
+    int sum = 0;
+    for (int i = 0; i < kBatch; i++) sum -= mask[i];
+    return sum;
+#endif
+}
+
+// Samples in occupied cells that wait for being taken, in order. A batch may be added as long as less than two wait.
+struct Queue {
+    int count = 0;
+    alignas(32) int32_t corner[3 * kBatch];  // of the cell, its lowest, in Volume::rows_of
+    alignas(32) float x[3 * kBatch], y[3 * kBatch], z[3 * kBatch];
+    alignas(32) float t[3 * kBatch];  // from the entry into the lattice, in spacings
+
+    HOLOREEL_INLINE_MEMBER void drop_batch() {
+        const auto move = [](auto* values) { std::memmove(values, values + kBatch, 2 * kBatch * sizeof *values); };
+        move(corner), move(x), move(y), move(z), move(t);
+        count -= kBatch;
+    }
+    // Fills a batch up with samples of the empty brick.
+    HOLOREEL_INLINE_MEMBER void pad() {
+        for (int i = 0; i < kBatch; i++) {
+            corner[i] = i < count ? corner[i] : 0;
+            x[i] = i < count ? x[i] : 0;
+            y[i] = i < count ? y[i] : 0;
+            z[i] = i < count ? z[i] : 0;
+            t[i] = i < count ? t[i] : 0;
+        }
+    }
+};
+
 struct Batch {
-    int count;
-    alignas(32) int32_t corner[kBatch];  // of the cell, its lowest, in Volume::rows_of
-    alignas(32) float x[kBatch], y[kBatch], z[kBatch], t[kBatch];  // t: from the entry into the lattice, in spacings
     alignas(32) float density[kBatch], alpha[kBatch], passed[kBatch], slope[kBatch];
 };
 
@@ -73,50 +108,49 @@ public:
         for (int a = 0; a < 3; a++) {
             start_[a] = static_cast<float>(o[a] + near * direction[a]);
             direction_[a] = direction[a];
-            inverse_[a] = std::abs(direction[a]) < 1e-12f ? 0.0f : 1.0f / direction[a];
+            const bool along = std::abs(direction[a]) < 1e-12f;
+            inverse_[a] = along ? 1e30f : 1.0f / direction[a];
+            forth_[a] = inverse_[a] > 0 ? 1 : -1;
             limit_[a] = static_cast<float>(volume.cells[a]);
         }
     }
 
-    // Fills `batch` with the next samples; false at the end of the ray. Samples come in order.
-    HOLOREEL_INLINE_MEMBER bool next(Batch& batch) {
-        while (next_ < samples_) {
-            if (skip()) continue;
-            collect(batch);
-            if (batch.count) return true;
+    // Adds the next samples until there is a whole batch or the ray ends.
+    template <class Fetch> HOLOREEL_INLINE_MEMBER void fill(Queue& queue, Fetch fetch) {
+        while (queue.count < 2 * kBatch && next_ < samples_) {
+            const int before = queue.count;
+            if (leap()) continue;
+            collect(queue);
+            for (int i = before; i < queue.count; i++) fetch(queue.corner[i]);
         }
-        return false;
     }
 
     double entry;  // where the ray enters, in spacings from its origin
 
 private:
-    HOLOREEL_INLINE_MEMBER int cell_at(int axis, float t) const {
+    HOLOREEL_INLINE_MEMBER int brick_at(int axis, float t) const {
         const float p = std::min(std::max(start_[axis] + t * direction_[axis], 0.0f), limit_[axis]);
-        return std::min(static_cast<int>(p), volume_.cells[axis] - 1);
+        return std::min(static_cast<int>(p), volume_.cells[axis] - 1) / kBrick;
     }
 
-    // Moves on to the end of an empty brick or block. Never past a sample beyond it: where in doubt, one step at a time.
-    HOLOREEL_INLINE_MEMBER bool skip() {
+    // Moves on to the first sample beyond the empty bricks around, if it is among such. A sample that is so near to their border
+    // that rounding decides is looked at again.
+    HOLOREEL_INLINE_MEMBER bool leap() {
         const float t = (static_cast<float>(next_) + jitter_) * step_;
-        const int x = cell_at(0, t), y = cell_at(1, t), z = cell_at(2, t);
-        const Volume& v = volume_;
-        const bool far = !v.block_full[(size_t(x / kBlock) * v.blocks[1] + y / kBlock) * v.blocks[2] + z / kBlock];
-        if (!far && v.brick_of[(size_t(x / kBrick) * v.bricks[1] + y / kBrick) * v.bricks[2] + z / kBrick]) return false;
-        const int edge = far ? kBlock : kBrick;
-        const int at[3] = {x & -edge, y & -edge, z & -edge};
+        const int at[3] = {brick_at(0, t), brick_at(1, t), brick_at(2, t)};
+        const int away = -volume_.brick_of[(size_t(at[0]) * volume_.bricks[1] + at[1]) * volume_.bricks[2] + at[2]];
+        if (away <= 0) return false;
         float leave = std::numeric_limits<float>::max();
         for (int a = 0; a < 3; a++) {
-            if (inverse_[a] == 0) continue;
-            const float wall = static_cast<float>(inverse_[a] > 0 ? at[a] + edge : at[a]);
-            leave = std::min(leave, (wall - start_[a]) * inverse_[a]);
+            const int wall = 2 * at[a] + 1 + forth_[a] * (2 * away - 1);  // in halves of bricks
+            leave = std::min(leave, (static_cast<float>(wall * (kBrick / 2)) - start_[a]) * inverse_[a]);
         }
-        const float to = std::min(leave * per_step_ - jitter_, static_cast<float>(samples_));
-        next_ = std::max(next_ + 1, static_cast<int>(to));
+        const float to = std::min(leave * per_step_ - jitter_ - 0.01f, static_cast<float>(samples_));
+        next_ = std::max(next_, static_cast<int>(std::max(to, -1.0f))) + 1;
         return true;
     }
 
-    HOLOREEL_INLINE_MEMBER void collect(Batch& batch) {
+    HOLOREEL_INLINE_MEMBER void collect(Queue& queue) {
         alignas(32) float x[kBatch], y[kBatch], z[kBatch], t[kBatch];
         alignas(32) int32_t corner[kBatch], inside[kBatch], brick[kBatch];
         const int32_t* bricks = volume_.brick_of.data();
@@ -135,26 +169,27 @@ private:
             y[i] = py - static_cast<float>(iy);
             z[i] = pz - static_cast<float>(iz);
             const int dx = ix & 3, dy = iy & 3, dz = iz & 3;
-            brick[i] = bricks[(ix >> 2) * stride_x + (iy >> 2) * stride_y + (iz >> 2)];
+            brick[i] = std::max(bricks[(ix >> 2) * stride_x + (iy >> 2) * stride_y + (iz >> 2)], 0);
             inside[i] = dx << 4 | dy << 2 | dz;
             corner[i] = brick[i] * kBrickVertices + dx * kStrideX + dy * kStrideY + dz;
         }
         const int left = std::min(samples_ - next_, kBatch);
-        int n = 0;
+        int n = queue.count;
         for (int i = 0; i < left; i++) {
-            batch.corner[n] = corner[i];
-            batch.x[n] = x[i];
-            batch.y[n] = y[i];
-            batch.z[n] = z[i];
-            batch.t[n] = t[i];
+            queue.corner[n] = corner[i];
+            queue.x[n] = x[i];
+            queue.y[n] = y[i];
+            queue.z[n] = z[i];
+            queue.t[n] = t[i];
             n += occupied[brick[i]] >> inside[i] & 1;
         }
-        batch.count = n;
+        queue.count = n;
         next_ += kBatch;
     }
 
     const Volume& volume_;
     float start_[3], direction_[3], inverse_[3], limit_[3];
+    int forth_[3];
     float step_, per_step_, jitter_;
     int next_ = 0, samples_;
 };
@@ -194,88 +229,113 @@ template <bool kSlope> HOLOREEL_INLINE void activate(Batch& batch, float step) {
     }
 }
 
-// Asks for the rows of a batch that will be sampled soon: they lie all over the table.
-template <int C> HOLOREEL_INLINE void fetch(const March& march, const Batch& batch) {
+template <int C, bool kSlope>
+HOLOREEL_INLINE void sample(const March& march, const Queue& queue, typename RowOf<C>::type* rows, Batch& batch) {
     const int32_t* corners = march.volume->rows_of.data();
-    for (int i = 0; i < batch.count; i++)
-        for (int along : {0, kStrideX})
-            for (int offset : {0, 1, kStrideY, kStrideY + 1})
-                __builtin_prefetch(march.table + size_t(corners[batch.corner[i] + along + offset]) * C);
+    for (int i = 0; i < kBatch; i++) {
+        rows[i] = interpolate<C>(march.table, corners + queue.corner[i], queue.x[i], queue.y[i], queue.z[i]);
+        batch.density[i] = rows[i][0];
+    }
+    activate<kSlope>(batch, static_cast<float>(march.rays.step));
 }
 
-template <int C, bool kSlope, class Rows>
-HOLOREEL_INLINE void sample(const March& march, Batch& batch, Rows& rows) {
-    const int32_t* corners = march.volume->rows_of.data();
-    for (int i = 0; i < batch.count; i++)
-        rows[i] = interpolate<C>(march.table, corners + batch.corner[i], batch.x[i], batch.y[i], batch.z[i]);
-    for (int i = 0; i < kBatch; i++) batch.density[i] = i < batch.count ? rows[i][0] : 0.0f;
-    activate<kSlope>(batch, static_cast<float>(march.rays.step));
+// Room for another batch.
+template <int C> HOLOREEL_INLINE void make_room(Chunk& chunk) {
+    const size_t needed = chunk.used + kBatch;
+    if (needed <= chunk.corner.size() && needed * C <= chunk.rows.size()) return;  // a tape may have served another table
+    const size_t size = 2 * needed + 64 * kBatch;
+    chunk.corner.resize(size);
+    for (auto* part : {&chunk.x, &chunk.y, &chunk.z, &chunk.weight, &chunk.distance, &chunk.after, &chunk.slope})
+        part->resize(size);
+    chunk.rows.resize(size * C);
 }
 
 template <int C, bool kTape>
 HOLOREEL_INLINE int64_t march_run(const March& march, int64_t first, int64_t last, Chunk* chunk) {
     using Row = typename RowOf<C>::type;
     const float least = static_cast<float>(march.rays.transmittance_min);
+    const Mask8 lanes = {0, 1, 2, 3, 4, 5, 6, 7};
+    const Lane8 ones = broadcast(1.0f);
     int64_t samples = 0;
-    Batch batches[2];
+    Batch batch;
+    Queue queue;
     Row rows[kBatch];
+    const int32_t* corners = march.volume->rows_of.data();
+    const auto fetch = [&](int32_t corner) {
+        for (int along : {0, kStrideX})
+            for (int offset : {0, kStrideY})
+                __builtin_prefetch(march.table + size_t(corners[corner + along + offset]) * C);
+    };
     for (int64_t ray = first; ray < last; ray++) {
         Walk walk(*march.volume, march.rays, ray);
         const float entry = static_cast<float>(walk.entry);
         Row sum = {};
-        float left = 1, distance = 0;
-        int now = 0;
-        bool open = true, more = walk.next(batches[0]);
-        if (more) fetch<C>(march, batches[0]);
-        while (open && more) {
-            Batch& batch = batches[now];
-            now ^= 1;
-            more = walk.next(batches[now]);
-            if (more) fetch<C>(march, batches[now]);
-            sample<C, kTape>(march, batch, rows);
-            int taken = 0;
-            for (; taken < batch.count && open; taken++) {
-                const float weight = left * batch.alpha[taken];
-                sum += rows[taken] * weight;
-                distance += weight * batch.t[taken];
-                left *= batch.passed[taken];
-                open = left > least;
-                if (!kTape) continue;
-                const int i = taken;
-                chunk->records.push_back({batch.corner[i], batch.x[i], batch.y[i], batch.z[i], weight,
-                                          entry + batch.t[i], left, batch.slope[i]});
-                chunk->rays.push_back(static_cast<int32_t>(ray));
-            }
+        Lane8 distance = {};
+        float left = 1;
+        queue.count = 0;
+        for (;;) {
+            walk.fill(queue, fetch);
+            if (queue.count == 0) break;
+            if (queue.count < kBatch) queue.pad();
+            sample<C, kTape>(march, queue, rows, batch);
+            // Products over the samples before each, in three steps.
+            Lane8 after = load_row<8>(batch.passed);
+            after *= __builtin_shuffle(after, ones, Mask8{8, 0, 1, 2, 3, 4, 5, 6});
+            after *= __builtin_shuffle(after, ones, Mask8{8, 8, 0, 1, 2, 3, 4, 5});
+            after *= __builtin_shuffle(after, ones, Mask8{8, 8, 8, 8, 0, 1, 2, 3});
+            after *= left;
+            const Lane8 before = __builtin_shuffle(after, broadcast(left), Mask8{8, 0, 1, 2, 3, 4, 5, 6});
+            const Mask8 reached = (before > least) & (lanes < queue.count);
+            const Lane8 weight = reinterpret_cast<Lane8>(reached & reinterpret_cast<Mask8>(before * load_row<8>(batch.alpha)));
+            const int taken = count_true(reached);
+            alignas(32) float weights[kBatch], afters[kBatch];
+            store_row<8>(weights, weight);
+            store_row<8>(afters, after);
+            for (int i = 0; i < kBatch; i++) sum += rows[i] * weights[i];
+            distance += weight * load_row<8>(queue.t);
+            left = afters[taken - 1];
             if (kTape) {
-                const float* from = reinterpret_cast<const float*>(rows);
-                chunk->rows.insert(chunk->rows.end(), from, from + size_t(taken) * C);
+                make_room<C>(*chunk);
+                const size_t at = chunk->used;
+                std::memcpy(&chunk->corner[at], queue.corner, sizeof(Mask8));
+                std::memcpy(&chunk->x[at], queue.x, sizeof(Lane8));
+                std::memcpy(&chunk->y[at], queue.y, sizeof(Lane8));
+                std::memcpy(&chunk->z[at], queue.z, sizeof(Lane8));
+                std::memcpy(&chunk->slope[at], batch.slope, sizeof(Lane8));
+                store_row<8>(&chunk->weight[at], weight);
+                store_row<8>(&chunk->distance[at], load_row<8>(queue.t) + entry);
+                store_row<8>(&chunk->after[at], after);
+                std::memcpy(&chunk->rows[at * C], rows, sizeof rows);
+                chunk->used += taken;
             }
             samples += taken;
+            if (taken < kBatch || !(left > least)) break;
+            queue.drop_batch();
         }
         if (kTape) {
-            chunk->ends.push_back(static_cast<uint32_t>(chunk->records.size()));
+            chunk->ends.push_back(static_cast<uint32_t>(chunk->used));
             chunk->left.push_back(left);
         }
         const float weights = 1 - left;
         sum[0] = left;
         store_row<C>(march.images.accumulated + C * ray, sum);
-        march.images.depth[ray] = static_cast<float>((distance + weights * walk.entry) * march.volume->spacing);
+        march.images.depth[ray] =
+            static_cast<float>((sum_row<8>(distance) + weights * walk.entry) * march.volume->spacing);
     }
     return samples;
 }
 
 template <int C> int64_t forward_rays(const March& march, int64_t first, int64_t last, Chunk* chunk) {
     if (!chunk) return march_run<C, false>(march, first, last, nullptr);
-    chunk->records.clear();
-    chunk->rows.clear();
+    chunk->used = 0;
     chunk->ends.clear();
     chunk->left.clear();
-    chunk->rays.clear();
     return march_run<C, true>(march, first, last, chunk);
 }
 
 template <int C>
-void backward_rays(const VideorfImageGradients& gradients, double spacing, int64_t first, Chunk& chunk) {
+void backward_rays(const VideorfImageGradients& gradients, double spacing, int64_t first, const Chunk& chunk, uint32_t* next,
+                   Scattered* sorted) {
     using Row = typename RowOf<C>::type;
     uint32_t begin = 0;
     for (size_t i = 0; i < chunk.ends.size(); begin = chunk.ends[i++]) {
@@ -287,45 +347,55 @@ void backward_rays(const VideorfImageGradients& gradients, double spacing, int64
         float behind = incoming[0] * chunk.left[i];
         incoming[0] = 0;
         for (uint32_t k = chunk.ends[i]; k-- > begin;) {
-            Record& record = chunk.records[k];
-            const Row row = load_row<C>(chunk.rows.data() + size_t(k) * C);
-            const float seen = sum_row<C>(row * incoming) + d_distance * record.distance;
-            record.slope *= record.after * seen - behind;
-            behind += record.weight * seen;
+            const Row row = load_row<C>(&chunk.rows[size_t(k) * C]);
+            const float seen = sum_row<C>(row * incoming) + d_distance * chunk.distance[k];
+            const float density = chunk.slope[k] * (chunk.after[k] * seen - behind);
+            behind += chunk.weight[k] * seen;
+            const int32_t brick = chunk.corner[k] / kBrickVertices;
+            sorted[next[brick]++] = {static_cast<int32_t>(ray), chunk.corner[k] - brick * kBrickVertices, chunk.x[k], chunk.y[k],
+                                     chunk.z[k], chunk.weight[k], density, 0.0f};
         }
     }
 }
 
 template <int C>
-void scatter_shard(const Volume& volume, const VideorfImageGradients& gradients, int shard, const Chunk* chunks,
-                   int64_t count, float* gradient) {
+void scatter_column(const Volume& volume, const VideorfImageGradients& gradients, Column column, const Scattered* sorted,
+                    const uint32_t* begins, float* gradient) {
     using Row = typename RowOf<C>::type;
-    const int from = shard * volume.shard_rows, to = std::min(from + volume.shard_rows, volume.rows - 1);
-    alignas(64) float elsewhere[C] = {};  // takes what belongs to other shards and to the empty row
-    for (const Chunk* chunk = chunks; chunk < chunks + count; chunk++) {
-        for (uint32_t i = chunk->begin[shard]; i < chunk->begin[shard + 1]; i++) {
-            const uint32_t index = chunk->order[i];
-            const Record& record = chunk->records[index];
+    Row own[kBrickVertices];
+    for (int32_t brick = column.first; brick < column.end; brick++) {
+        if (begins[brick] == begins[brick + 1]) continue;
+        std::memset(own, 0, sizeof own);
+        for (const Scattered* at = sorted + begins[brick]; at < sorted + begins[brick + 1]; at++) {
             Row row = {};
-            if (gradients.accumulated)
-                row = load_row<C>(gradients.accumulated + size_t(chunk->rays[index]) * C) * record.weight;
-            row[0] = record.slope;
-            const int32_t* rows = volume.rows_of.data() + record.corner;
-            const float wx[2] = {1 - record.x, record.x}, wy[2] = {1 - record.y, record.y};
-            const float wz[2] = {1 - record.z, record.z};
-            for (int k = 0; k < 8; k++) {
-                const int r = rows[(k >> 2) * kStrideX + (k >> 1 & 1) * kStrideY + (k & 1)];
-                float* target = r >= from && r < to ? gradient + size_t(r) * C : elsewhere;
-                store_row<C>(target, load_row<C>(target) + row * (wx[k >> 2] * wy[k >> 1 & 1] * wz[k & 1]));
-            }
+            if (gradients.accumulated) row = load_row<C>(gradients.accumulated + size_t(at->ray) * C) * at->weight;
+            row[0] = at->density;
+            Row* corner = own + at->corner;
+            const Row far = row * at->x, near = row - far;
+            const auto add = [&](Row part, Row* edge) {
+                const Row behind = part * at->z;
+                edge[0] += part - behind;
+                edge[1] += behind;
+            };
+            const Row near_far = near * at->y, far_far = far * at->y;
+            add(near - near_far, corner);
+            add(near_far, corner + kStrideY);
+            add(far - far_far, corner + kStrideX);
+            add(far_far, corner + kStrideX + kStrideY);
+        }
+        const int32_t* rows = volume.rows_of.data() + size_t(brick) * kBrickVertices;
+        for (int i = 0; i < kBrickVertices; i++) {
+            if (rows[i] == volume.rows - 1) continue;  // what empty vertices hold is not trained
+            float* target = gradient + size_t(rows[i]) * C;
+            store_row<C>(target, load_row<C>(target) + own[i]);
         }
     }
 }
 
 static const MarchKernels* march_of(int channels) {
-    static const MarchKernels four = {kLanes, forward_rays<4>, backward_rays<4>, scatter_shard<4>};
-    static const MarchKernels eight = {kLanes, forward_rays<8>, backward_rays<8>, scatter_shard<8>};
-    static const MarchKernels sixteen = {kLanes, forward_rays<16>, backward_rays<16>, scatter_shard<16>};
+    static const MarchKernels four = {kLanes, forward_rays<4>, backward_rays<4>, scatter_column<4>};
+    static const MarchKernels eight = {kLanes, forward_rays<8>, backward_rays<8>, scatter_column<8>};
+    static const MarchKernels sixteen = {kLanes, forward_rays<16>, backward_rays<16>, scatter_column<16>};
     return channels == 4 ? &four : channels == 8 ? &eight : channels == 16 ? &sixteen : nullptr;
 }
 

@@ -27,35 +27,54 @@ void check(const VideorfLattice& lattice) {
 Volume::Volume(const VideorfLattice& lattice) {
     check(lattice);
     rows = lattice.rows;
-    shard_rows = std::max(1, (rows - 1 + kShards - 1) / kShards);
     spacing = lattice.spacing;
     for (int a = 0; a < 3; a++) {
         lowest[a] = lattice.lowest[a];
         cells[a] = lattice.shape[a] - 1;
         bricks[a] = (cells[a] + kBrick - 1) / kBrick;
-        blocks[a] = (cells[a] + kBlock - 1) / kBlock;
     }
     brick_of.assign(size_t(bricks[0]) * bricks[1] * bricks[2], 0);
-    block_full.assign(size_t(blocks[0]) * blocks[1] * blocks[2], 0);
     occupied.assign(1, 0);
     rows_of.assign(kBrickVertices, rows - 1);
-    shards.assign(1, 0);
     size_t brick = 0;
     for (int bx = 0; bx < bricks[0]; bx++)
-        for (int by = 0; by < bricks[1]; by++)
-            for (int bz = 0; bz < bricks[2]; bz++, brick++) {
-                if (!add_brick(lattice, bx * kBrick, by * kBrick, bz * kBrick)) continue;
-                brick_of[brick] = static_cast<int32_t>(occupied.size()) - 1;
-                constexpr int kRatio = kBlock / kBrick;
-                block_full[(size_t(bx / kRatio) * blocks[1] + by / kRatio) * blocks[2] + bz / kRatio] = 1;
-            }
+        for (int by = 0; by < bricks[1]; by++) {
+            const int32_t first = static_cast<int32_t>(occupied.size());
+            for (int bz = 0; bz < bricks[2]; bz++, brick++)
+                if (add_brick(lattice, bx * kBrick, by * kBrick, bz * kBrick))
+                    brick_of[brick] = static_cast<int32_t>(occupied.size()) - 1;
+            const int32_t end = static_cast<int32_t>(occupied.size());
+            if (end > first) columns[2 * (bx & 1) + (by & 1)].push_back({first, end});
+        }
+    measure_distances();
+}
+
+// Chessboard distances by the two sweeps of Rosenfeld and Pfaltz (1968): each looks at the neighbors that came before.
+void Volume::measure_distances() {
+    const int far = std::max({bricks[0], bricks[1], bricks[2]});
+    for (int32_t& brick : brick_of)
+        if (brick == 0) brick = -far;
+    const auto visit = [&](int x, int y, int z, int side) {
+        const int64_t step_x = int64_t(bricks[1]) * bricks[2], step_y = bricks[2];
+        int32_t& brick = brick_of[x * step_x + y * step_y + z];
+        for (int i = 0; i < 13 && brick < -1; i++) {
+            const int nx = x + side * (i / 9 - 1), ny = y + side * (i / 3 % 3 - 1), nz = z + side * (i % 3 - 1);
+            if (nx < 0 || ny < 0 || nz < 0 || nx >= bricks[0] || ny >= bricks[1] || nz >= bricks[2]) continue;
+            brick = std::max(brick, std::min(brick_of[nx * step_x + ny * step_y + nz], 0) - 1);
+        }
+    };
+    for (int x = 0; x < bricks[0]; x++)
+        for (int y = 0; y < bricks[1]; y++)
+            for (int z = 0; z < bricks[2]; z++) visit(x, y, z, 1);
+    for (int x = bricks[0]; x-- > 0;)
+        for (int y = bricks[1]; y-- > 0;)
+            for (int z = bricks[2]; z-- > 0;) visit(x, y, z, -1);
 }
 
 bool Volume::add_brick(const VideorfLattice& lattice, int x0, int y0, int z0) {
     const int64_t step_y = lattice.shape[2], step_x = step_y * lattice.shape[1];
     int32_t found[kBrickVertices];
     uint64_t full = 0;
-    uint32_t mask = 0;
     for (int i = 0; i < kBrickVertices; i++) {
         const int dx = i / kStrideX, dy = i / kStrideY % kStrideY, dz = i % kStrideY;
         const int x = x0 + dx, y = y0 + dy, z = z0 + dz;
@@ -64,7 +83,6 @@ bool Volume::add_brick(const VideorfLattice& lattice, int x0, int y0, int z0) {
         const int32_t row = lattice.lookup[x * step_x + y * step_y + z];
         if (row < 0) continue;
         found[i] = row;
-        mask |= 1u << (row / shard_rows);
         for (int corner = 0; corner < 8; corner++) {  // the cells it is a corner of
             const int cx = dx - (corner >> 2), cy = dy - (corner >> 1 & 1), cz = dz - (corner & 1);
             if (cx < 0 || cy < 0 || cz < 0 || cx >= kBrick || cy >= kBrick || cz >= kBrick) continue;
@@ -75,7 +93,6 @@ bool Volume::add_brick(const VideorfLattice& lattice, int x0, int y0, int z0) {
     if (!full) return false;
     occupied.push_back(full);
     rows_of.insert(rows_of.end(), found, found + kBrickVertices);
-    shards.push_back(mask);
     return true;
 }
 
