@@ -45,6 +45,7 @@ class FrameViews:
         if border < 0:
             raise ValueError("border must be 0 or more")
         names = [name for name in capture.camera_names(split) if (name, frame) in capture.images]
+        self.frame = frame
         self.number = capture.frame_start + frame  # on the timeline, for messages
         self.masks: dict[str, SeenMask] = {}
         parts = []
