@@ -21,17 +21,24 @@ if TYPE_CHECKING:  # the measuring itself needs torch, which --help need not wai
 def prepare(arguments: list[str]) -> Callable[..., None]:
     """Return the measurement that the arguments name."""
     name = next((argument for argument in arguments if not argument.startswith("-")), "")
+    if name == "videorf":  # its defaults hang on the preset, and torch comes with them
+        from .bench_videorf import prepare as prepare_videorf
+
+        return prepare_videorf(arguments)
     return MEASUREMENTS.get(name, run)
 
 
 def run(
-    what: Annotated[Literal["raster", "train", "render", "ablation", "seams"], tyro.conf.Positional],
+    what: Annotated[
+        Literal["raster", "march", "train", "render", "ablation", "seams", "videorf"], tyro.conf.Positional
+    ],
 ) -> None:
     """Measure something on this machine; `holoreel bench WHAT --help` explains each.
 
     Args:
-        what: `raster`, the kernels; `train`, whole training iterations; `render`, frames per second of a reel;
-            `ablation`, what each part of the method brings; `seams`, the hand-over between a reel's segments.
+        what: `raster` and `march`, the kernels of Gaussians and of VideoRF; `train`, whole training iterations;
+            `render`, frames per second of a reel; `ablation`, what each part of Spacetime Gaussians brings; `seams`,
+            the hand-over between a reel's segments; `videorf`, quality over bytes of VideoRF and what its parts bring.
     """
     raise HoloreelError(f"there is nothing to measure called {what!r} here.")
 
@@ -69,6 +76,36 @@ def raster(
         rows += _against_reference(rounds)
     if json is not None:
         write_json(json, {"machine": hardware, "rows": [row.as_dict() for row in rows]})
+
+
+def march(
+    what: Annotated[Literal["march"], tyro.conf.Positional],
+    edge: int = 96,
+    channels: int = 8,
+    repeats: int = 5,
+    json: Path | None = None,
+) -> None:
+    """Print how many samples the ray march of VideoRF takes in a second, and how that compares with plain torch.
+
+    Args:
+        what: The march through a lattice, forward, and forward and backward.
+        edge: Vertices along each side of the lattice.
+        channels: Numbers in a row: the density and the features.
+        repeats: How often each is measured; the best counts.
+        json: Write the figures to this file too.
+    """
+    _check(repeats, json)
+    from ..videorf.bench import bench_march
+
+    speed = bench_march(edge, channels, repeats=repeats)
+    hardware = _hardware()
+    print(
+        f"{_describe(hardware)}; {speed.vertices:,} vertices, {channels} channels, {speed.samples_per_ray:.1f} samples "
+        f"per ray, {speed.threads} threads\nmillion samples per second: {speed.forward:.1f} forward, "
+        f"{speed.training:.1f} forward and backward, {speed.twin_ratio:.0f} times as many as plain torch"
+    )
+    if json is not None:
+        write_json(json, {"machine": hardware, **speed._asdict()})
 
 
 def train(
@@ -198,6 +235,7 @@ def ablation(
 
 MEASUREMENTS: dict[str, Callable[..., None]] = {
     "raster": raster,
+    "march": march,
     "train": train,
     "render": render,
     "ablation": ablation,

@@ -28,7 +28,7 @@ def prepare(arguments: list[str]) -> Callable[..., None]:
     if name not in METHODS:
         return run
     method = cast(Method, importlib.import_module(f".{METHODS[name]}", __package__))
-    preset = _preset(arguments) or method.DEFAULT
+    preset = preset_in(arguments) or method.DEFAULT
     if preset not in method.PRESETS:
         raise HoloreelError(f"--preset {preset}: no such preset; take one of {', '.join(method.PRESETS)}.")
     return method.command(preset)
@@ -44,7 +44,8 @@ def run(method: Annotated[Literal["stg", "videorf"], tyro.conf.Positional]) -> N
     raise HoloreelError(f"there is no method {method!r} here.")
 
 
-def _preset(arguments: list[str]) -> str | None:
+def preset_in(arguments: list[str]) -> str | None:
+    """Return what the arguments name with --preset, None where they do not."""
     for index, argument in enumerate(arguments):
         if argument == "--preset" and index + 1 < len(arguments):
             return arguments[index + 1]

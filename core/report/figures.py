@@ -77,6 +77,24 @@ def plot_frames(path: Path, frames: Sequence[int], psnr: Sequence[float], ssim: 
     _save(figure, path)
 
 
+def plot_curves(path: Path, curves: dict[str, list[list[Any]]], labels: Sequence[str], xlabel: str) -> None:
+    """Plot curves by title, each a list of points (x, y) per label, over a logarithmic x. The first one stands out."""
+    from matplotlib import colormaps
+
+    figure, plots = _figure(len(labels), height=4.2)
+    palette = colormaps["tab20"].colors  # type: ignore[attr-defined]
+    for index, (axes, label) in enumerate(zip(np.atleast_1d(plots), labels, strict=True)):
+        for number, (title, parts) in enumerate(curves.items()):
+            x, y = zip(*sorted(tuple(point) for point in parts[index]), strict=True)
+            color, width = (INK, 2.2) if number == 0 else (palette[(number - 1) % len(palette)], 0.9)
+            axes.plot(x, y, color=color, linewidth=width, marker=".", label=title if index == 0 else None)
+        axes.set(xlabel=xlabel, ylabel=label, xscale="log")
+        axes.xaxis.set_major_formatter("{x:g}")
+        axes.xaxis.set_minor_formatter("{x:g}")
+    figure.legend(loc="outside lower center", ncols=4, frameon=False, fontsize=8)
+    _save(figure, path)
+
+
 def plot_rig(path: Path, cameras: Sequence[Camera], held_out: set[str], points: NDArray[np.float32]) -> None:
     """Draw the cameras and the seed points from above and from the side (x, y and x, z of the world)."""
     figure, plots = _figure(2, height=3.6)
