@@ -14,7 +14,7 @@ from .errors import HoloreelError
 from .gaussians.decoder import Activation
 from .reel import VIDEORF, Triple, reel_kind
 from .render import Backend
-from .videorf.model import HEADER as MODEL_HEADER
+from .videorf.model import is_model
 
 Quality = Literal["full", "fast", "draft"]  # of a VideoRF's drawings: how long the steps of a march are
 
@@ -114,7 +114,7 @@ def open_player(
 
         refuse(decoder_output=decoder_output)
         return VideoPlayer(path, rung, quality or "full", backend)
-    if (Path(path) / MODEL_HEADER).is_file():
+    if is_model(path):
         from .videorf.player import FieldPlayer
 
         refuse(decoder_output=decoder_output, rung=rung)

@@ -1,11 +1,15 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""What `holoreel export` writes: files for other programs, and smaller ones. Needs numpy alone, and torch for `.pt`."""
+"""What `holoreel export` writes: files for other programs, and smaller ones.
+
+Needs numpy alone, torch for `.pt`, and PyAV to decode a VideoRF.
+"""
 
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 from .camera import Camera
 from .errors import HoloreelError
@@ -15,14 +19,19 @@ from .gaussians.flat import flattened
 from .gaussians.ply import write_ply
 from .gaussians.splat3d import write_moment
 from .gaussians.splatv import write_splatv
-from .reel import NEAR, Loaded, SegmentPayload, load_gaussians, write_segments
+from .reel import NEAR, VIDEORF, Loaded, SegmentPayload, load_gaussians, reel_kind, write_segments
+from .videorf.decode import DecodedVideo, FrameSource
+from .videorf.model import is_model, read_field_video
+from .videorf.package import read_video_reel
+from .videorf.points import field_points, write_field_points
 
-Form = Literal["splatv", "3dgs", "ply", "compact"]
+Form = Literal["splatv", "3dgs", "ply", "compact", "points"]
 ENDINGS: dict[Form, tuple[str, ...]] = {
     "splatv": (".splatv",),
     "3dgs": (".ply",),
     "ply": (".ply", ".reel"),
     "compact": (".stgc", ".reel"),
+    "points": (".ply",),
 }
 _UP = {"X": (1, 0, 0), "Y": (0, 1, 0), "Z": (0, 0, 1)}
 _VIEW = (1280, 720, 1000.0)  # width, height and focal length in pixels of a view that nobody chose
@@ -139,3 +148,36 @@ def export_reel(source: Source, out: Path, suffix: str, segment: int | None = No
         provenance=first.reel.provenance if first.reel else {"file": source.path.name},
         suffix=suffix,
     )
+
+
+def open_frames(path: Path, rung: str | None = None) -> FrameSource:
+    """Open what points can be made of: a VideoRF reel, one of its rungs, or the folder of a trained model.
+
+    Raises `HoloreelError` where it is neither.
+    """
+    if reel_kind(path) == VIDEORF:
+        return DecodedVideo(read_video_reel(path), rung)
+    if not is_model(path):
+        raise HoloreelError(f"{path} is no VideoRF: make points of Gaussians with --to 3dgs.")
+    if rung is not None:
+        raise HoloreelError(f"{path} was not coded yet and has no rungs: leave --rung away.")
+    return read_field_video(path)
+
+
+def export_points(
+    source: FrameSource, frames: list[float], name: Callable[[float], Path], eyes: NDArray | None = None
+) -> Iterator[tuple[float, Path, int]]:
+    """Write frames of the timeline as colored points, one file each; yield frame, file and how many points it has.
+
+    Colors are as in `videorf.points.field_points`. Raises `HoloreelError` where there is no such frame.
+    """
+    first, last = source.frame_start, source.frame_start + source.frame_count - 1
+    for frame in frames:
+        if not (first <= frame <= last and frame == int(frame)):
+            raise HoloreelError(f"There is no frame {frame:g} to make points of: take {first} to {last}.")
+    for frame in frames:
+        index = int(frame) - first
+        points = field_points(source.lattice, source.table_of(index), source.rows(index), source.shading, eyes)
+        path = name(frame)
+        write_field_points(path, points)
+        yield frame, path, len(points.xyz)

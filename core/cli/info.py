@@ -7,11 +7,13 @@ from typing import Annotated, Any
 
 import tyro
 
-from ..capture import CaptureOptions, read_capture
+from ..capture import Capture, CaptureOptions, read_capture
 from ..capture.layouts import find_layout
 from ..capture.media import media_path
 from ..gaussians.decoder import Activation, decoder_path
-from ..reel import Loaded, load_gaussians
+from ..reel import VIDEORF, Loaded, load_gaussians, reel_kind
+from ..videorf.inspect import describe_model, describe_video_reel
+from ..videorf.model import is_model
 
 
 def run(
@@ -24,7 +26,8 @@ def run(
     """Say what a file holds, and what is unusual or wrong.
 
     Args:
-        file: a .reel, .ply, .stgc or .splatv, or a capture (a folder in any layout, or a transforms.json).
+        file: a .reel, .ply, .stgc or .splatv, the NAME.model of a VideoRF, or a capture (a folder in any layout, or a
+            transforms.json).
         decoder_output: what the decoder of a bare full model (.ply with a .pt beside it) ends in; sigmoid without it.
         as_json: print JSON for programs to read.
         options: how a capture is read.
@@ -35,6 +38,10 @@ def run(
 
 def describe(path: Path, options: CaptureOptions, decoder_output: Activation | None = None) -> dict[str, Any]:
     """Return the facts about one file, ready for JSON; `problems` lists sentences."""
+    if reel_kind(path) == VIDEORF:
+        return describe_video_reel(path)
+    if is_model(path):
+        return describe_model(path)
     if path.is_dir() or path.suffix.lower() == ".json":
         return describe_capture(path, options)
     loaded = load_gaussians(path, decoder_output=decoder_output)
@@ -117,7 +124,7 @@ def describe_capture(path: Path, options: CaptureOptions) -> dict[str, Any]:
     if not capture.camera_names("test"):
         problems.append("No camera is held out for testing: eval needs --split train.")
     if not capture.seeds:
-        problems.append("There are no seed points: training has nothing to start from.")
+        problems.append("There are no seed points: training of Gaussians has nothing to start from.")
     return {
         "file": str(capture.source),
         "what": "a multi-view capture",
@@ -128,12 +135,21 @@ def describe_capture(path: Path, options: CaptureOptions) -> dict[str, Any]:
         },
         "frames": f"{capture.frame_count} from frame {capture.frame_start} at {capture.fps:g} fps",
         "pictures": len(capture.images),
+        "masks": len(capture.masks),
+        "subject": _subject(capture),
+        "subject bounds": capture.bounds,
         "depth maps": len(capture.depths),
         "frames with seed points": len(capture.seeds),
         "bytes on disk": sum(file.stat().st_size for file in set(map(media_path, capture.images.values()))),
         "notes": list(capture.notes),
         "problems": problems,
     }
+
+
+def _subject(capture: Capture) -> str:
+    if capture.masked:
+        return "cut out of every picture"
+    return "not told apart in every picture: a VideoRF needs masks or transparent pictures"
 
 
 def table(facts: dict[str, Any]) -> str:

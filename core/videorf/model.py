@@ -168,6 +168,11 @@ def read_rows(folder: str | Path, frame: int, shape: tuple[int, int]) -> Rows:
     return rows
 
 
+def is_model(path: str | Path) -> bool:
+    """Whether a path is the folder of a trained model."""
+    return (Path(path) / HEADER).is_file()
+
+
 def read_field_video(folder: str | Path) -> FieldVideo:
     """Read a model's folder, without its rows. Raises `HoloreelError` naming the file or the field that is wrong."""
     path = Path(folder) / HEADER
