@@ -90,20 +90,22 @@ class FrameTrainer:
         self,
         group: GroupField,
         views: FrameViews,
+        frame: int,
         start: Rows,
         previous: Rows | None,
         config: VideoConfig,
         iterations: int,
         round_trip: RoundTrip | None = None,
     ) -> None:
-        """Begin with the rows `start` (N, C); `previous` are those of the frame before in the same group, or None.
+        """Begin a frame, counted from 0, with the rows `start` (N, C).
 
-        `round_trip` takes rows through the codec that `config.codec_from` speaks of.
+        `previous` are those of the frame before in the same group, or None. `round_trip` takes rows through the codec
+        that `config.codec_from` speaks of.
         """
         ranges = config.ranges
-        self.group, self.views, self.config, self.iterations = group, views, config, iterations
-        self.iteration, self.error, self.round_trip = 0, math.nan, round_trip
-        self.generator = torch.Generator().manual_seed(_seed(config.seed, views.frame))
+        self.group, self.views, self.frame, self.config = group, views, frame, config
+        self.iteration, self.iterations, self.error, self.round_trip = 0, iterations, math.nan, round_trip
+        self.generator = torch.Generator().manual_seed(_seed(config.seed, frame))
         self.table = torch.from_numpy(np.concatenate((clamped(start, ranges), ranges.empty[None])))
         self.quantum = torch.from_numpy(ranges.step)
         low, high = torch.tensor(ranges.low), torch.tensor(ranges.high)

@@ -337,10 +337,10 @@ class _Run:
     ) -> FrameTrainer:
         views = FrameViews(self.capture, frame, border=self.config.border)
         trip = through_codec(field_of.table, previous, self.config) if self.config.codec_from < 1 else None
-        return FrameTrainer(field_of, views, start, previous, self.config, iterations, trip)
+        return FrameTrainer(field_of, views, frame, start, previous, self.config, iterations, trip)
 
     def _heard(self, stage: str, trainer: FrameTrainer) -> None:
-        self._tell(stage, trainer.views.frame, psnr_of(trainer.error), 1)
+        self._tell(stage, trainer.frame, psnr_of(trainer.error), 1)
 
     def _keep(self, frame: int, trainer: FrameTrainer) -> None:
         self.fits[frame] = psnr_of(trainer.error)
