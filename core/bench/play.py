@@ -8,7 +8,7 @@ from typing import Any
 from ..camera import Camera
 from ..draw import Player
 from ..gaussians.player import GaussianPlayer
-from ..videorf.player import FramePlayer
+from ..videorf.player import FramePlayer, VideoPlayer
 from .render import LISTED, NOT_CULLED, measure_player
 
 
@@ -16,6 +16,8 @@ def measure_play(player: Player, camera: Camera) -> dict[str, Any]:
     """Return `width`, `height`, `frames`, `fps`, a `sentence` that says it, and what else is known of the kind."""
     if isinstance(player, GaussianPlayer):
         return _gaussians(player, camera)
+    if isinstance(player, VideoPlayer):
+        player.source.forget()
     seconds: list[float] = []
     parts: dict[str, list[float]] = {}
     for index in range(player.frame_count):

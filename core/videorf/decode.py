@@ -82,6 +82,11 @@ class DecodedVideo:
         with self.watch.part("unpack"):
             return self.ranges.decode(codes)
 
+    def forget(self) -> None:
+        """Let go of what was decoded, so that the time of decoding can be measured anew."""
+        self._codes.clear()
+        self._last = -1
+
     def _decode(self, frame: int) -> None:
         self._last = -1  # until the frame is there
         with self.watch.part("decode"):
