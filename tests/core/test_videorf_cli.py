@@ -6,6 +6,7 @@ import math
 
 import numpy as np
 import pytest
+from holoreel.core import evaluate as evaluation
 from holoreel.core.camera import Camera, write_camera
 from holoreel.core.capture import Capture, read_capture, write_capture
 from holoreel.core.cli import main
@@ -94,6 +95,27 @@ def test_subjects_are_measured_over_white_and_over_their_masks(filmed):
     assert metrics["pooled"]["psnr_mask"] == pytest.approx(-10 * math.log10(np.mean(inner)), abs=0.02)
     assert metrics["pooled_cameras"]["side"]["psnr"] == pytest.approx(-10 * math.log10(np.mean(errors[1::3])), abs=0.02)
     assert metrics["size"]["bytes_per_frame"] == 200
+
+
+def test_networks_see_the_whole_and_the_subjects_box(filmed, monkeypatch):
+    folder, *_ = filmed
+    monkeypatch.setattr(evaluation, "LPIPS_LEAST", 8)
+    shapes = []
+
+    class Spy:
+        name, input_range = "lpips_alex", "standard"
+
+        def __call__(self, image, truth):
+            shapes.append(truth.shape[:2])
+            return float(truth.shape[0])
+
+    metrics = evaluate_player(Gray(folder), read_capture(folder), lpips=[Spy()])
+    for view, (whole, box) in zip(metrics["views"], zip(shapes[::2], shapes[1::2], strict=True), strict=True):
+        rgba = read_image(folder / "pictures" / view["camera"] / f"{view['frame']:04d}.png")
+        rows, columns = np.nonzero(rgba[..., 3])
+        assert whole == (36, 44)
+        assert box == (np.ptp(rows) + 1, np.ptp(columns) + 1)
+        assert (view["lpips_alex"], view["lpips_alex_crop"]) == (36, box[0])
 
 
 def test_what_cannot_be_measured_of_a_subject_is_left_out():
