@@ -3,6 +3,8 @@
 
 import json
 import math
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -240,6 +242,12 @@ def test_points_are_the_vertices_that_can_be_seen(filmed, tmp_path, capsys):
         main(["export", str(folder / "ball.model"), "--to", "points", "--frames", "102:104", "--out", str(many)]) == 0
     )
     assert sorted(path.name for path in many.iterdir()) == ["0102.ply", "0103.ply", "0104.ply"]
+
+
+def test_decoding_and_points_need_numpy_alone():
+    modules = "export, videorf.decode, videorf.points, videorf.inspect".replace(", ", ", holoreel.core.")
+    code = f"import sys; sys.modules.update(torch=None, av=None, scipy=None); import holoreel.core.{modules}"
+    subprocess.run([sys.executable, "-c", code], check=True, timeout=60)
 
 
 def test_directions_are_spread_and_may_not_matter(filmed):
