@@ -65,7 +65,8 @@ def run(
     moments = (frame is not None) + (frames is not None)
     if (to in MOMENTS) != (moments == 1) or (to in MOMENTS and segment is not None):
         raise HoloreelError(
-            "--to 3dgs and --to points need --frame N or --frames FIRST:LAST, without --segment; others need neither."
+            f"--to {MOMENTS[0]} or {MOMENTS[1]} needs --frame N or --frames FIRST:LAST, without --segment; others need "
+            "neither."
         )
     if to != "points" and (cameras is not None or rung is not None):
         raise HoloreelError("--cameras and --rung are for --to points alone: leave them away.")

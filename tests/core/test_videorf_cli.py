@@ -272,7 +272,7 @@ def test_directions_are_spread_and_may_not_matter(filmed):
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        ("REEL --to points --out OUT/a.ply", "need --frame N or --frames"),
+        ("REEL --to points --out OUT/a.ply", "needs --frame N or --frames"),
         ("REEL --to points --frame 101.5 --out OUT/a.ply", "no frame 101.5 to make points of: take 101 to 105"),
         ("REEL --to points --frames 104:106 --out OUT", "no frame 106"),
         ("REEL --to points --frame 101 --out OUT/a.obj", "--to points writes .ply"),
