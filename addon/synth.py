@@ -10,7 +10,6 @@ from typing import Any
 
 import bpy
 import numpy as np
-from mathutils import Vector
 
 from ..core.camera import Camera
 from ..core.errors import HoloreelError
@@ -19,6 +18,7 @@ from . import compat
 from .cameras import camera_from_object, new_camera_object, set_format
 
 Emit = Callable[[dict[str, Any]], None]
+Bounds = tuple[tuple[float, ...], tuple[float, ...]]
 
 TARGET_NAME = "Holoreel Target"  # an object of this name is what rigs aim at
 _GEOMETRY = {"MESH", "CURVE", "CURVES", "SURFACE", "META", "FONT", "POINTCLOUD", "VOLUME"}
@@ -28,9 +28,12 @@ _AGREEMENT_PX = 0.01
 def render(job: dict[str, Any], emit: Emit) -> dict[str, Any]:
     """Render what `job` lists (see `core.synth`); emits `scene` once and `view` after each picture."""
     scene = open_scene(job["scene"])
+    facts = describe(scene)
+    if job["film"] == "transparent":
+        facts["bounds"] = subject_bounds(scene, range(job["frames"][0], job["frames"][1] + 1))
     scene.frame_set(job["frames"][0])
-    cameras = [Camera.from_json(camera) for camera in job["cameras"]] or place_rig(job, scene)
-    emit({"event": "scene", "cameras": [camera.to_json() for camera in cameras], "scene": describe(scene)})
+    cameras = [Camera.from_json(camera) for camera in job["cameras"]] or place_rig(job, scene, facts.get("bounds"))
+    emit({"event": "scene", "cameras": [camera.to_json() for camera in cameras], "scene": facts})
     apply_look(scene, job)
     objects = make_cameras(scene, cameras)
     frame_now = None
@@ -68,12 +71,12 @@ def describe(scene: bpy.types.Scene) -> dict[str, Any]:
     }
 
 
-def place_rig(job: dict[str, Any], scene: bpy.types.Scene) -> list[Camera]:
-    """Make the rig that the job asks for, placed by what the scene shows at the current frame."""
-    return make_rig(job["preset"], fit_to_scene(RigRequest(**job["rig"]), scene_facts(scene)))
+def place_rig(job: dict[str, Any], scene: bpy.types.Scene, bounds: Bounds | None) -> list[Camera]:
+    """Make the rig that the job asks for, placed by what the scene shows at the current frame, or within `bounds`."""
+    return make_rig(job["preset"], fit_to_scene(RigRequest(**job["rig"]), scene_facts(scene, bounds)))
 
 
-def scene_facts(scene: bpy.types.Scene) -> SceneFacts:
+def scene_facts(scene: bpy.types.Scene, bounds: Bounds | None) -> SceneFacts:
     """Read what `core.rig` places rigs by."""
     depsgraph = bpy.context.evaluated_depsgraph_get()
     camera = scene.camera
@@ -81,21 +84,45 @@ def scene_facts(scene: bpy.types.Scene) -> SceneFacts:
     return SceneFacts(
         camera=camera_from_object(camera, scene, depsgraph) if camera and camera.data.type == "PERSP" else None,
         target=tuple(target.evaluated_get(depsgraph).matrix_world.translation) if target else None,
-        bounds=visible_bounds(depsgraph),
+        bounds=bounds or visible_bounds(depsgraph),
     )
 
 
-def visible_bounds(depsgraph: bpy.types.Depsgraph) -> tuple[Any, Any] | None:
+def subject_bounds(scene: bpy.types.Scene, frames: range) -> Bounds | None:
+    """Return the lower and the upper corner of what is rendered in any of the frames, None if nothing."""
+    boxes = []
+    for frame in frames:
+        scene.frame_set(frame)
+        if box := visible_bounds(bpy.context.evaluated_depsgraph_get()):
+            boxes.append(box)
+    if not boxes:
+        return None
+    low, high = np.min([box[0] for box in boxes], axis=0), np.max([box[1] for box in boxes], axis=0)
+    return tuple(low.tolist()), tuple(high.tolist())
+
+
+def visible_bounds(depsgraph: bpy.types.Depsgraph) -> Bounds | None:
     """Return the lower and the upper corner of what is rendered, None where that is nothing."""
-    corners = []
+    boxes = []
     for instance in depsgraph.object_instances:
         thing = instance.object
         if thing.type in _GEOMETRY and not thing.hide_render and thing.dimensions.length > 0:
-            corners += [instance.matrix_world @ Vector(corner) for corner in thing.bound_box]
-    if not corners:
+            points = _points(thing) @ np.array(instance.matrix_world, np.float64)[:3].T
+            boxes += [points.min(axis=0), points.max(axis=0)]
+    if not boxes:
         return None
-    points = np.array(corners, np.float64)
-    return tuple(points.min(axis=0).tolist()), tuple(points.max(axis=0).tolist())
+    return tuple(np.min(boxes, axis=0).tolist()), tuple(np.max(boxes, axis=0).tolist())
+
+
+def _points(thing: bpy.types.Object) -> np.ndarray:
+    """Points that an evaluated object lies between, homogeneous (N, 4): a mesh's vertices, else corners of its box."""
+    if thing.type == "MESH" and len(thing.data.vertices):
+        values = np.empty(3 * len(thing.data.vertices), np.float32)
+        thing.data.vertices.foreach_get("co", values)
+        points = values.reshape(-1, 3).astype(np.float64)
+    else:
+        points = np.array(thing.bound_box, np.float64)
+    return np.concatenate([points, np.ones((len(points), 1))], axis=1)
 
 
 def make_cameras(scene: bpy.types.Scene, cameras: list[Camera]) -> list[bpy.types.Object]:

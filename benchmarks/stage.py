@@ -28,15 +28,18 @@ def parse() -> argparse.Namespace:
 
 
 def import_subject(path: Path, clip: str, hidden: list[str]) -> list[bpy.types.Object]:
-    """Import the file, play one action on its armature, and return its visible meshes."""
+    """Import the file, play one action on its armature over and over from frame 1, and return its visible meshes."""
     bpy.ops.import_scene.gltf(filepath=str(path))
     bones = {b.custom_shape for o in bpy.data.objects if o.type == "ARMATURE" for b in o.pose.bones if b.custom_shape}
     for shape in [o for o in bpy.data.objects if o in bones or o.name in hidden]:
         bpy.data.objects.remove(shape)
     for armature in [o for o in bpy.data.objects if o.type == "ARMATURE"]:
-        for track in list(armature.animation_data.nla_tracks):
-            armature.animation_data.nla_tracks.remove(track)
-        armature.animation_data.action = bpy.data.actions[clip]
+        animation = armature.animation_data
+        for track in list(animation.nla_tracks):
+            animation.nla_tracks.remove(track)
+        animation.action = None
+        strip = animation.nla_tracks.new().strips.new(clip, 1, bpy.data.actions[clip])
+        strip.repeat = 100
     return [o for o in bpy.data.objects if o.type == "MESH"]
 
 

@@ -8,6 +8,7 @@ The world's z points up. A rig stands around a target point; its middle is seen 
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +22,7 @@ MAX_CAMERAS = 1000
 _DEFAULT_FOV_DEGREES = 50.0
 _DEFAULT_AZIMUTH_DEGREES = -90.0
 _DEFAULT_ELEVATION_DEGREES = 15.0
+_GOLDEN_ANGLE_DEGREES = 180 * (3 - 5**0.5)
 _MARGIN = 1.1  # of the bounds' sphere, where no camera says how far away to stand
 
 
@@ -65,6 +67,27 @@ class SceneFacts:
     bounds: tuple[Vector, Vector] | None = None
 
 
+@dataclass(frozen=True)
+class Preset:
+    """A way to place cameras, and what a request says where its user does not."""
+
+    place: Callable[[RigSettings], list[Camera]]
+    span_degrees: float
+    rise_degrees: float
+    elevation_degrees: float | None = None  # None: the active camera's
+
+
+def request(preset: str, cameras: int, width: int, height: int, **wishes: Any) -> RigRequest:
+    """Return the request for a preset's rig; `wishes` are fields of `RigRequest`, and those that are None are open.
+
+    What the preset has an opinion on is filled in. Raises `HoloreelError` where there is no such preset.
+    """
+    chosen = _preset(preset)
+    said = {name: value for name, value in wishes.items() if value is not None}
+    opinion = {key: getattr(chosen, key) for key in ("span_degrees", "rise_degrees", "elevation_degrees")}
+    return RigRequest(cameras, width, height, **(opinion | said))
+
+
 def fit_to_scene(request: RigRequest, scene: SceneFacts) -> RigSettings:
     """Fill in what the request leaves open.
 
@@ -104,8 +127,7 @@ def fit_to_scene(request: RigRequest, scene: SceneFacts) -> RigSettings:
 
 def make_rig(preset: str, settings: RigSettings) -> list[Camera]:
     """Return the cameras of a preset, named cam00, cam01, …; raises `HoloreelError` for numbers that make no rig."""
-    if preset not in PRESETS:
-        raise HoloreelError(f"there is no rig {preset!r}; take one of {', '.join(PRESETS)}.")
+    chosen = _preset(preset)
     if not 1 <= settings.cameras <= MAX_CAMERAS:
         raise HoloreelError(f"a rig has 1 to {MAX_CAMERAS} cameras, not {settings.cameras}.")
     if not (math.isfinite(settings.radius) and settings.radius > 1e-6):
@@ -116,7 +138,7 @@ def make_rig(preset: str, settings: RigSettings) -> list[Camera]:
         raise HoloreelError(f"the span of a rig lies between 0 and 360 degrees, not {settings.span_degrees:g}.")
     if abs(settings.elevation_degrees) + abs(settings.rise_degrees) >= 90:
         raise HoloreelError("elevation and rise of a rig must together stay under 90 degrees; give a lower elevation.")
-    return PRESETS[preset](settings)
+    return chosen.place(settings)
 
 
 def arc(settings: RigSettings) -> list[Camera]:
@@ -137,7 +159,33 @@ def arc(settings: RigSettings) -> list[Camera]:
     return cameras
 
 
-PRESETS: dict[str, Callable[[RigSettings], list[Camera]]] = {"arc": arc}
+def dome(settings: RigSettings) -> list[Camera]:
+    """Cameras all around and above the target, all aimed at it.
+
+    From one camera to the next the azimuth grows by the golden angle (scaled by span / 360), so that any few in a row
+    look from all sides; elevations rise evenly, in steps of equal area on the sphere, by `rise_degrees` either way of
+    `elevation_degrees`.
+    """
+    count, middle, rise = settings.cameras, settings.elevation_degrees, abs(settings.rise_degrees)
+    lowest, highest = (math.sin(math.radians(middle + lift)) for lift in (-rise, rise))
+    cameras = []
+    for index in range(count):
+        turned = index * _GOLDEN_ANGLE_DEGREES % 360 * settings.span_degrees / 360
+        elevation = math.degrees(math.asin(lowest + (highest - lowest) * (index + 0.5) / count))
+        cameras.append(_aimed(settings, settings.azimuth_degrees + turned, elevation, camera_name(index, count)))
+    return cameras
+
+
+PRESETS = {
+    "arc": Preset(arc, span_degrees=50.0, rise_degrees=4.0),
+    "dome": Preset(dome, span_degrees=360.0, rise_degrees=35.0, elevation_degrees=30.0),
+}
+
+
+def _preset(name: str) -> Preset:
+    if name not in PRESETS:
+        raise HoloreelError(f"there is no rig {name!r}; take one of {', '.join(PRESETS)}.")
+    return PRESETS[name]
 
 
 def camera_name(index: int, count: int) -> str:

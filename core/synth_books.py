@@ -168,6 +168,7 @@ class Books:
             frame_start=job.frames[0],
             depths={view: self.depth(view) for view in views} if job.depth else {},
             seeds={frame: self.seeds(frame) for frame in range(job.frame_count)} if job.seed_points else {},
+            bounds=tuple(map(tuple, bounds)) if (bounds := self.scene.get("bounds")) else None,
             source=self.out / "transforms.json",
         )
 

@@ -11,7 +11,7 @@ from tqdm import tqdm
 
 from ..blender import find_blender
 from ..errors import HoloreelError
-from ..rig import RigRequest
+from ..rig import request as rig_request
 from ..synth import SynthJob, synthesize
 
 
@@ -20,7 +20,7 @@ def run(
     /,
     out: Path,
     frames: str,
-    rig: Literal["arc"] = "arc",
+    rig: Literal["arc", "dome"] = "arc",
     cameras: int = 12,
     size: str = "320x180",
     samples: int = 64,
@@ -35,8 +35,8 @@ def run(
     azimuth: float | None = None,
     elevation: float | None = None,
     fov: float | None = None,
-    span: float = 50.0,
-    rise: float = 4.0,
+    span: float | None = None,
+    rise: float | None = None,
     seed: int = 0,
     blender: Path | None = None,
     overwrite: bool = False,
@@ -47,12 +47,13 @@ def run(
         scene: The .blend file.
         out: Folder of the capture; transforms.json is written there when all views are done.
         frames: First and last frame, both included, as 1:12.
-        rig: How the cameras stand.
-        cameras: Number of cameras; cam00 is the one in the middle.
+        rig: How the cameras stand: on an arc in front of the scene, or on a dome all around a subject.
+        cameras: Number of cameras; cam00 is the one in the middle of the arc.
         size: Width and height of the pictures in pixels, as 320x180.
         samples: Cycles samples per pixel.
         holdout: Cameras kept out of the training, for evaluation.
-        film: Whether the background is part of the pictures or transparent.
+        film: Whether the background is part of the pictures, or transparent: then only a subject is captured, and the
+            box around all its motion is written down.
         depth: Also write depth maps (EXR, planar z).
         seed_points: Seed points per frame, from the depth of the training cameras; 0 for none.
         denoise: Denoise the pictures.
@@ -60,16 +61,19 @@ def run(
         target: The point the rig aims at, instead of what the scene suggests.
         radius: Distance from the target, instead of the active camera's.
         azimuth: Direction of the rig's middle in degrees from +x, instead of the active camera's.
-        elevation: Elevation of the rig's middle in degrees, instead of the active camera's.
+        elevation: Elevation of the rig's middle in degrees, instead of the active camera's (of the dome: 30).
         fov: Horizontal field of view in degrees, instead of the active camera's.
-        span: Degrees from the first camera of the arc to the last.
-        rise: Degrees by which cameras stand higher and lower in turn.
+        span: Degrees of azimuth that the rig spans: 50 of the arc, 360 of the dome.
+        rise: Degrees by which cameras stand higher and lower than the middle: 4 on the arc, 35 on the dome.
         seed: Seed of all that is random.
         blender: The blender executable, or a Python that has bpy.
         overwrite: Replace the capture of another job in this folder.
     """
     width, height = parse_size(size)
-    request = RigRequest(cameras, width, height, target, radius, azimuth, elevation, fov, span, rise)
+    request = rig_request(
+        rig, cameras, width, height, target=target, radius=radius, azimuth_degrees=azimuth,
+        elevation_degrees=elevation, fov_degrees=fov, span_degrees=span, rise_degrees=rise,
+    )  # fmt: skip
     job = SynthJob(scene, request, parse_frames(frames), rig, samples, holdout, film, depth, seed_points, denoise, seed)
     begin = time.monotonic()
     with tqdm(unit="view", dynamic_ncols=True, smoothing=0.1) as bar:
