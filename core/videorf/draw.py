@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Pictures of a field: march, deferred shading and compositing for every pixel of a camera."""
 
-from collections.abc import Callable
+from ctypes import c_float
 from functools import lru_cache
 from typing import NamedTuple
 
@@ -13,8 +13,9 @@ from torch import Tensor
 from ..camera import Camera
 from . import reference
 from .deferred import DeferredShading, composite
-from .field import DEFAULT_RULES, FieldLattice, Marched, MarchRules, Rays
-from .march import Volume, march
+from .field import DEFAULT_RULES, FieldLattice, MarchRules, Rays, check_march
+from .march import Volume, plain_table
+from .native import CNetwork, CPicture, CView, call
 from .shading import Shading
 
 Triple = tuple[float, float, float]
@@ -42,12 +43,40 @@ def draw_field(
 ) -> FieldDrawing:
     """Draw a table (N + 1, C) of a prepared lattice as a camera sees it, through any lens, on the processor.
 
-    Pixels where the lens sees nothing show the background.
+    Pixels where the lens sees nothing show the background. Raises `HoloreelError` where the network takes other
+    features than the table has.
     """
     table = table.detach()
-    return _draw(lambda rays: march(volume, table, rays, rules), shading, camera, background, torch.device("cpu"))
+    check_march(volume.field, table, Rays(torch.zeros(0, 3), torch.zeros(0, 3)))
+    padded, shape = plain_table(table), shading.shape
+    origins, directions = camera_rays(camera)
+    weights = np.concatenate([part.ravel() for layer in shading.layers for part in layer]).astype(np.float32)
+    size = (camera.height, camera.width)
+    drawing = FieldDrawing(np.empty((*size, 3), np.float32), np.empty(size, np.float32), np.empty(size, np.float32))
+    forward = camera.world_to_camera[2, :3]
+    frequencies = -1 if shape.frequencies is None else shape.frequencies
+    call(
+        "videorf_draw",
+        volume.handle,
+        padded.data_ptr(),
+        padded.shape[1],
+        CNetwork(shape.features, frequencies, shape.hidden, weights.ctypes.data),
+        CView(
+            camera.width,
+            camera.height,
+            origins.ctypes.data,
+            directions.ctypes.data,
+            rules.step,
+            rules.transmittance_min,
+            (c_float * 3)(*forward),
+            (c_float * 3)(*background),
+        ),
+        CPicture(*(part.ctypes.data for part in drawing)),
+    )
+    return drawing
 
 
+@torch.no_grad()
 def draw_field_torch(
     field: FieldLattice,
     table: Tensor,
@@ -58,21 +87,7 @@ def draw_field_torch(
     chunk: int = CHUNK,
 ) -> FieldDrawing:
     """Draw as `draw_field` does, in plain torch on the table's device, `chunk` rays at a time."""
-    table = table.detach()
-    return _draw(
-        lambda rays: reference.march(field, table, rays, rules), shading, camera, background, table.device, chunk
-    )
-
-
-@torch.no_grad()
-def _draw(
-    run: Callable[[Rays], Marched],
-    shading: Shading,
-    camera: Camera,
-    background: Triple,
-    device: torch.device,
-    chunk: int = CHUNK,
-) -> FieldDrawing:
+    table, device = table.detach(), table.device
     origins, directions = (torch.from_numpy(part) for part in camera_rays(camera))
     network = DeferredShading.of(shading).to(device)
     color = torch.tensor(background, dtype=torch.float32, device=device)
@@ -83,14 +98,14 @@ def _draw(
         o, d = origins[part].to(device), directions[part].to(device)
         seen = torch.isfinite(d).all(-1)
         d = torch.where(seen[:, None], d, forward)
-        marched = run(Rays(o, d))
+        marched = reference.march(field, table, Rays(o, d), rules)
         left = torch.where(seen, marched.transmittance.float(), 1.0)
         image[part] = composite(network(marched.features.float(), d), left, color).cpu()
         alpha[part] = (1 - left).cpu()
         along = (d * forward).sum(-1) * marched.depth.float() / (1 - left)
         depth[part] = torch.where(left < 1, along, torch.inf).cpu()
-    shape = (camera.height, camera.width)
-    return FieldDrawing(image.reshape(*shape, 3).numpy(), alpha.reshape(shape).numpy(), depth.reshape(shape).numpy())
+    size = (camera.height, camera.width)
+    return FieldDrawing(image.reshape(*size, 3).numpy(), alpha.reshape(size).numpy(), depth.reshape(size).numpy())
 
 
 @lru_cache(maxsize=2)

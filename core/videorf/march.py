@@ -59,23 +59,29 @@ def march(volume: Volume, table: Tensor, rays: Rays, rules: MarchRules = DEFAULT
     """
     check_march(volume.field, table, rays)
     channels = table.shape[1]
-    width = next(width for width in WIDTHS if width >= channels)
-    padded = torch.nn.functional.pad(table, (0, width - channels)) if width > channels else table
-    plain = Rays(*(None if part is None else _plain(part) for part in rays))  # type: ignore[arg-type]
-    accumulated, depth = _March.apply(volume, plain, rules, _plain(padded))
+    plain = Rays(*(None if part is None else plain_tensor(part) for part in rays))  # type: ignore[arg-type]
+    accumulated, depth = _March.apply(volume, plain, rules, plain_table(table))
     return Marched(accumulated[:, 1:channels], accumulated[:, 0], depth)
 
 
 def count_samples(volume: Volume, table: Tensor, rays: Rays, rules: MarchRules = DEFAULT_RULES) -> int:
     """Return how many samples the march of these rays takes, all in occupied cells."""
     check_march(volume.field, table, rays)
-    padded = torch.nn.functional.pad(table, (0, next(w for w in WIDTHS if w >= table.shape[1]) - table.shape[1]))
-    plain = Rays(*(None if part is None else _plain(part) for part in rays))  # type: ignore[arg-type]
-    return _forward(volume, plain, rules, _plain(padded.detach()))[2]
+    plain = Rays(*(None if part is None else plain_tensor(part) for part in rays))  # type: ignore[arg-type]
+    return _forward(volume, plain, rules, plain_table(table.detach()))[2]
 
 
-def _plain(tensor: Tensor) -> Tensor:
+def plain_tensor(tensor: Tensor) -> Tensor:
+    """Return a tensor as the kernels take it: on the processor, float32, without gaps."""
     return tensor.to("cpu", torch.float32).contiguous()
+
+
+def plain_table(table: Tensor) -> Tensor:
+    """Return a table as the march takes it: of a width it is built for, with zeros behind its own channels."""
+    width = next(width for width in WIDTHS if width >= table.shape[1])
+    return plain_tensor(
+        torch.nn.functional.pad(table, (0, width - table.shape[1])) if width > table.shape[1] else table
+    )
 
 
 def _address(tensor: Tensor | None) -> int | None:
@@ -132,7 +138,7 @@ class _March(torch.autograd.Function):
         if ctx.tape is None:
             raise RuntimeError("the gradient of a march can be taken once: march again")
         tape, ctx.tape = ctx.tape, None
-        accumulated, depth = (None if gradient is None else _plain(gradient) for gradient in gradients)
+        accumulated, depth = (None if gradient is None else plain_tensor(gradient) for gradient in gradients)
         gradient = torch.empty(ctx.shape)
         images = CImages(_address(accumulated), _address(depth))
         library = tape.volume.library

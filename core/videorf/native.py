@@ -5,7 +5,7 @@ import ctypes
 import functools
 import os
 import sys
-from ctypes import POINTER, Structure, c_char_p, c_double, c_int, c_int32, c_int64, c_void_p
+from ctypes import POINTER, Structure, c_char_p, c_double, c_float, c_int, c_int32, c_int64, c_uint32, c_void_p
 from pathlib import Path
 
 from ..errors import HoloreelError
@@ -43,6 +43,45 @@ class CImages(Structure):
     _fields_ = (("accumulated", c_void_p), ("depth", c_void_p))
 
 
+class CNetwork(Structure):
+    """`VideorfNetwork`."""
+
+    _fields_ = (("features", c_int32), ("frequencies", c_int32), ("hidden", c_int32), ("weights", c_void_p))
+
+
+class CView(Structure):
+    """`VideorfView`."""
+
+    _fields_ = (
+        ("width", c_int32),
+        ("height", c_int32),
+        ("origins", c_void_p),
+        ("directions", c_void_p),
+        ("step", c_double),
+        ("transmittance_min", c_double),
+        ("forward", c_float * 3),
+        ("background", c_float * 3),
+    )
+
+
+class CPicture(Structure):
+    """`VideorfPicture`."""
+
+    _fields_ = (("image", c_void_p), ("alpha", c_void_p), ("depth", c_void_p))
+
+
+class CStep(Structure):
+    """`VideorfStep`."""
+
+    _fields_ = (
+        *((name, c_int64) for name in ("rows", "count")),
+        *((name, c_int32) for name in ("channels", "neighbors")),
+        *((name, c_void_p) for name in ("values", "mean", "square", "gradient", "previous", "near", "seams")),
+        *((name, c_void_p) for name in ("step", "rates", "low", "high")),
+        *((name, c_double) for name in ("spatial", "temporal", "seam", "beta1", "beta2", "epsilon")),
+    )
+
+
 _SIGNATURES = {
     "videorf_abi": (c_int, ()),
     "videorf_last_error": (c_char_p, ()),
@@ -58,6 +97,12 @@ _SIGNATURES = {
     ),
     "videorf_backward": (c_int, (c_void_p, POINTER(CImages), c_void_p)),
     "videorf_tape_free": (None, (c_void_p,)),
+    "videorf_draw": (
+        c_int,
+        (c_void_p, c_void_p, c_int32, POINTER(CNetwork), POINTER(CView), POINTER(CPicture)),
+    ),
+    "videorf_optimize": (c_int, (POINTER(CStep),)),
+    "videorf_add_noise": (c_int, (c_void_p, c_int64, c_int32, c_void_p, c_uint32, c_void_p)),
 }
 
 
@@ -108,3 +153,10 @@ def set_lanes(lanes: int) -> int:
     if used == 0:
         raise HoloreelError(f"This machine or build has no ray march of {lanes} lanes; take 4, or 0 for the best.")
     return used
+
+
+def call(name: str, *arguments: object) -> None:
+    """Call a kernel; raise `HoloreelError` with its reason where it declines."""
+    library = load_kernels()
+    if getattr(library, name)(*arguments) != 0:
+        raise HoloreelError(f"The kernel {name} declines: {library.videorf_last_error().decode()}.")

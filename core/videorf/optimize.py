@@ -9,6 +9,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from .mapping import BLOCK, MappingTable
+from .march import plain_tensor
+from .native import CStep, call
 
 BETAS = (0.9, 0.99)  # of Adam's moments; a frame has few hundred iterations
 EPSILON = 1e-10  # Adam's; the gradient of L_spatial alone, on vertices no ray meets, is about 1e-8
@@ -77,15 +79,19 @@ class TableOptimizer:
         betas: tuple[float, float] = BETAS,
         epsilon: float = EPSILON,
     ) -> None:
-        self.neighbors = image_neighbors(neighbors) if isinstance(neighbors, MappingTable) else neighbors
-        if rows.ndim != 2 or len(rows) != len(self.neighbors.rows) + 1:
-            raise ValueError(f"the rows are {tuple(rows.shape)}, the neighbors those of {len(self.neighbors.rows)}")
-        if previous is not None and previous.shape != rows[:-1].shape:
-            raise ValueError(f"the rows before are {tuple(previous.shape)}, not {tuple(rows[:-1].shape)}")
-        self.rows, self.step_size, self.low, self.high, self.previous = rows, step, low, high, previous
-        self.betas, self.epsilon = betas, epsilon
+        found = image_neighbors(neighbors) if isinstance(neighbors, MappingTable) else neighbors
+        check_step(found, rows, previous)
+        count, sides = found.rows.shape
+        if sides > 8 or (found.rows < -1).any() or (found.rows >= count).any():
+            raise ValueError("a row has at most 8 neighbors, and they are rows of the table")
+        if rows.dtype != torch.float32 or not rows.is_contiguous() or rows.device.type != "cpu":
+            raise ValueError("the rows must be float32, on the processor and without gaps: they change in place")
+        self.rows, self.betas, self.epsilon, self.count = rows, betas, epsilon, 0
         self.mean, self.square = torch.zeros_like(rows[:-1]), torch.zeros_like(rows[:-1])
-        self.count = 0
+        self._previous = None if previous is None else plain_tensor(previous)
+        self._near = np.where(found.rows >= 0, found.rows, np.arange(count, dtype=np.int32)[:, None])
+        self._seams = (found.seam << np.arange(sides, dtype=np.uint8)).sum(1).astype(np.uint8)
+        self._columns = [plain_tensor(column).expand(rows.shape[1]).contiguous() for column in (step, low, high)]
 
     @torch.no_grad()
     def step(
@@ -93,34 +99,54 @@ class TableOptimizer:
     ) -> None:
         """Go one step with the gradient (N + 1, C) of the other losses and a learning rate per channel (C).
 
-        `spatial`, `temporal` and `seam` weigh the losses of `losses.spatial_loss` and `temporal_loss`.
+        `spatial`, `temporal` and `seam` weigh the losses of `losses.spatial_loss` and `temporal_loss`. The bits do not
+        depend on the number of threads.
         """
+        if gradient.shape != self.rows.shape:
+            raise ValueError(f"the gradient is {tuple(gradient.shape)}, the rows {tuple(self.rows.shape)}")
         self.count += 1
-        rows, total = self.rows[:-1], gradient[:-1].clone()
-        scale = 1.0 / (self.step_size * max(len(rows), 1))
-        if spatial:
-            for side, across in zip(self.neighbors.rows.T, self.neighbors.seam.T, strict=True):
-                near = torch.from_numpy(side.astype(np.int64)).to(rows.device)
-                weight = torch.from_numpy(np.where(across, seam, 1.0) * (side >= 0)).to(rows)
-                slope = ((rows - rows[near.clamp(min=0)]) / self.step_size).clamp(-1, 1)
-                total += spatial * scale * slope * weight[:, None]
-        if temporal and self.previous is not None:
-            total += temporal * scale * ((rows - self.previous) / self.step_size).clamp(-1, 1)
-        b1, b2 = self.betas
-        self.mean.lerp_(total, 1 - b1)
-        self.square.lerp_(total.square(), 1 - b2)
-        root = (self.square / (1 - b2**self.count)).sqrt() + self.epsilon
-        moved = rows - rates / (1 - b1**self.count) * self.mean / root
-        self.rows[:-1] = torch.minimum(torch.maximum(moved, self.low), self.high)
+        gradient, rates = plain_tensor(gradient), plain_tensor(rates).expand(self.rows.shape[1]).contiguous()
+        step, low, high = self._columns
+        tensors = (self.rows, self.mean, self.square, gradient, self._previous)
+        request = CStep(
+            len(self.rows) - 1,
+            self.count,
+            self.rows.shape[1],
+            self._near.shape[1],
+            *(None if tensor is None else tensor.data_ptr() for tensor in tensors),
+            self._near.ctypes.data,
+            self._seams.ctypes.data,
+            *(column.data_ptr() for column in (step, rates, low, high)),
+            *(spatial, temporal, seam, *self.betas, self.epsilon),
+        )
+        call("videorf_optimize", request)
+
+
+def check_step(neighbors: Neighbors, rows: Tensor, previous: Tensor | None) -> None:
+    """Raise ValueError where an optimizer's parts do not go together."""
+    if rows.ndim != 2 or len(rows) != len(neighbors.rows) + 1:
+        raise ValueError(f"the rows are {tuple(rows.shape)}, the neighbors those of {len(neighbors.rows)}")
+    if previous is not None and previous.shape != rows[:-1].shape:
+        raise ValueError(f"the rows before are {tuple(previous.shape)}, not {tuple(rows[:-1].shape)}")
 
 
 def noisy_rows(rows: Tensor, step: Tensor, seed: int, out: Tensor | None = None) -> Tensor:
     """Return rows (N + 1, C) with uniform noise of one quantizer step (C): what training sees of the rounding to come.
 
-    The last row, that of empty vertices, gets none. The noise hangs on `seed` alone. `out` is filled if given.
+    The last row, that of empty vertices, gets none. The noise hangs on `seed` alone, not on the number of threads.
+    `out` (float32, without gaps) is filled if given.
     """
-    generator = torch.Generator().manual_seed(seed)
-    noise = (torch.rand(rows.shape, generator=generator) - 0.5) * step
-    noise[-1] = 0
+    rows = plain_tensor(rows.detach())
     out = torch.empty_like(rows) if out is None else out
-    return torch.add(rows, noise, out=out)
+    if out.shape != rows.shape or out.dtype != torch.float32 or not out.is_contiguous():
+        raise ValueError(f"the noisy rows need {tuple(rows.shape)} numbers, float32 and without gaps")
+    step = plain_tensor(step).expand(rows.shape[1]).contiguous()
+    count, channels = len(rows) - 1, rows.shape[1]
+    call("videorf_add_noise", rows.data_ptr(), count, channels, step.data_ptr(), noise_key(seed), out.data_ptr())
+    out[-1] = rows[-1]
+    return out
+
+
+def noise_key(seed: int) -> int:
+    """Return 32 bits that hang on all of a seed's: seeds next to each other give noise that is not alike."""
+    return int(np.random.SeedSequence(seed).generate_state(1)[0])

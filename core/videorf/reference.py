@@ -1,12 +1,16 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The ray march in plain torch, any device and precision: the oracle of the compiled one, written from `field`'s
-rules.
+"""The ray march and the optimizer in plain torch, any device and precision.
+
+The oracles of the compiled ones, written from the rules of `field` and `optimize`.
 """
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from .field import DEFAULT_RULES, FieldLattice, Marched, MarchRules, Rays, check_march
+from .mapping import MappingTable
+from .optimize import BETAS, EPSILON, Neighbors, check_step, image_neighbors, noise_key
 
 _CORNERS = [(dx, dy, dz) for dx in (0, 1) for dy in (0, 1) for dz in (0, 1)]
 
@@ -70,3 +74,62 @@ def _interpolate(field: FieldLattice, table: Tensor, points: Tensor) -> tuple[Te
         mean = mean + weight[..., None] * torch.where(row[..., None] >= 0, table[row.clamp(min=0)], table[-1].detach())
         found |= row >= 0
     return mean, found
+
+
+class TableOptimizer:
+    """`optimize.TableOptimizer`, on the rows' device and in their precision."""
+
+    def __init__(
+        self,
+        neighbors: MappingTable | Neighbors,
+        rows: Tensor,
+        step: Tensor,
+        low: Tensor,
+        high: Tensor,
+        previous: Tensor | None = None,
+        betas: tuple[float, float] = BETAS,
+        epsilon: float = EPSILON,
+    ) -> None:
+        found = image_neighbors(neighbors) if isinstance(neighbors, MappingTable) else neighbors
+        check_step(found, rows, previous)
+        self.rows, self.betas, self.epsilon, self.count = rows, betas, epsilon, 0
+        self.mean, self.square = torch.zeros_like(rows[:-1]), torch.zeros_like(rows[:-1])
+        self._previous = None if previous is None else previous.to(rows)
+        self._step, self._low, self._high = (column.to(rows) for column in (step, low, high))
+        self._near = torch.from_numpy(found.rows.astype(np.int64)).to(rows.device)
+        self._seam = torch.from_numpy(found.seam).to(rows.device)
+
+    @torch.no_grad()
+    def step(
+        self, gradient: Tensor, rates: Tensor, spatial: float = 0.0, temporal: float = 0.0, seam: float = 1.0
+    ) -> None:
+        """Go one step, as the compiled optimizer does."""
+        self.count += 1
+        rows, total = self.rows[:-1], gradient[:-1].to(self.rows).clone()
+        scale = 1.0 / (self._step * max(len(rows), 1))
+        if spatial:
+            for near, across in zip(self._near.T, self._seam.T, strict=True):
+                weight = torch.where(across, seam, 1.0) * (near >= 0)
+                slope = ((rows - rows[near.clamp(min=0)]) / self._step).clamp(-1, 1)
+                total += spatial * scale * slope * weight.to(rows)[:, None]
+        if temporal and self._previous is not None:
+            total += temporal * scale * ((rows - self._previous) / self._step).clamp(-1, 1)
+        b1, b2 = self.betas
+        self.mean.lerp_(total, 1 - b1)
+        self.square.lerp_(total.square(), 1 - b2)
+        root = (self.square / (1 - b2**self.count)).sqrt() + self.epsilon
+        moved = rows - rates.to(rows) / (1 - b1**self.count) * self.mean / root
+        self.rows[:-1] = torch.minimum(torch.maximum(moved, self._low), self._high)
+
+
+def noisy_rows(rows: Tensor, step: Tensor, seed: int) -> Tensor:
+    """Return the rows with the same noise as `optimize.noisy_rows`, on their device and in their precision.
+
+    The numbers are "lowbias32" (C. Wellons, 2018) of each value's place in the table, in 32-bit integers.
+    """
+    x = torch.arange(rows[:-1].numel(), device=rows.device).reshape(rows[:-1].shape)
+    x = (x * 0x9E3779B9 + noise_key(seed)) & 0xFFFFFFFF
+    for shift, factor in ((16, 0x7FEB352D), (15, 0x846CA68B), (16, 1)):
+        x = ((x ^ (x >> shift)) * factor) & 0xFFFFFFFF
+    share = ((x >> 8).to(rows) + 0.5) / 2**24 - 0.5
+    return torch.cat((rows[:-1] + step.to(rows) * share, rows[-1:]))

@@ -9,7 +9,9 @@
 #include <mutex>
 #include <stdexcept>
 
+#include "draw.hpp"
 #include "march.hpp"
+#include "tables.hpp"
 #include "thread_pool.hpp"
 
 namespace holoreel {
@@ -24,20 +26,36 @@ int wanted_lanes = 0;                   // 0: the widest this machine has
 
 thread_local char error_text[256] = "";
 
-const MarchKernels* wide_here(int channels) {
+bool has_wide() {
 #if defined(__x86_64__) || defined(_M_X64)
-    if (__builtin_cpu_supports("avx2") && __builtin_cpu_supports("fma")) return wide_march(channels);
+    return wide_shade() && __builtin_cpu_supports("avx2") && __builtin_cpu_supports("fma");
 #else
-    (void)channels;
+    return false;
 #endif
-    return nullptr;
 }
 
+bool use_wide() { return wanted_lanes != 4 && has_wide(); }
+
 const MarchKernels& kernels(int channels) {
-    const MarchKernels* wide = wanted_lanes == 4 ? nullptr : wide_here(channels);
-    const MarchKernels* found = wide ? wide : narrow_march(channels);
+    const MarchKernels* found = use_wide() ? wide_march(channels) : narrow_march(channels);
     if (!found) throw std::invalid_argument("a table has 4, 8 or 16 channels");
     return *found;
+}
+
+const TableKernels& table_kernels(int channels) {
+    if (channels < 1 || channels > 16) throw std::invalid_argument("a table has 1 to 16 channels");
+    return *(use_wide() ? wide_tables(channels) : narrow_tables(channels));
+}
+
+void check(const VideorfStep& step) {
+    if (step.rows < 0 || step.rows > INT32_MAX || step.neighbors < 0 || step.neighbors > 8 || step.count < 1)
+        throw std::invalid_argument("the rows, the neighbors or the count of an optimizer's step are out of range");
+}
+
+// Calls work(first, last) for runs of rows.
+template <class Work> void each_run(int64_t rows, Work work) {
+    constexpr int64_t kRows = 2048;
+    pool().run((rows + kRows - 1) / kRows, [&](int64_t run) { work(run * kRows, std::min(rows, (run + 1) * kRows)); });
 }
 
 void check(const VideorfRays& rays) {
@@ -134,7 +152,7 @@ VIDEORF_API int videorf_get_threads() { return get_threads(); }
 
 // 8, 4, or 0 for the widest; returns the width in use, 0 where this machine or build does not have the one asked for.
 VIDEORF_API int videorf_set_lanes(int lanes) {
-    if (lanes != 0 && lanes != 4 && !(lanes == 8 && wide_here(4))) return 0;
+    if (lanes != 0 && lanes != 4 && !(lanes == 8 && has_wide())) return 0;
     wanted_lanes = lanes;
     return kernels(4).lanes;
 }
@@ -193,4 +211,32 @@ VIDEORF_API void videorf_tape_free(Tape* tape) {
     std::lock_guard<std::mutex> lock(call_mutex);
     std::unique_ptr<Tape> given(tape);
     if (given && spare_tapes.size() < kSpareTapes) spare_tapes.push_back(std::move(given));
+}
+
+VIDEORF_API int videorf_draw(const Volume* volume, const float* table, int32_t channels, const VideorfNetwork* network,
+                             const VideorfView* view, const VideorfPicture* picture) {
+    return guarded([&] {
+        check(*network, channels);
+        check(*view);
+        check(VideorfRays{0, nullptr, nullptr, nullptr, view->step, view->transmittance_min});
+        draw(*volume, table, channels, *network, *view, kernels(channels), use_wide() ? wide_shade() : narrow_shade(), *picture);
+    });
+}
+
+// Moves `values`, and brings `mean` and `square` up to date. The bits do not depend on the number of threads.
+VIDEORF_API int videorf_optimize(const VideorfStep* step) {
+    return guarded([&] {
+        check(*step);
+        const TableKernels& kernel = table_kernels(step->channels);
+        each_run(step->rows, [&](int64_t first, int64_t last) { kernel.moments(*step, first, last); });
+        each_run(step->rows, [&](int64_t first, int64_t last) { kernel.move(*step, first, last); });
+    });
+}
+
+// out = rows + uniform noise of -step / 2 ... step / 2, which hangs on `key` and the place in the table alone.
+VIDEORF_API int videorf_add_noise(const float* rows, int64_t count, int32_t channels, const float* step, uint32_t key, float* out) {
+    return guarded([&] {
+        const TableKernels& kernel = table_kernels(channels);
+        each_run(count, [&](int64_t first, int64_t last) { kernel.noise(rows, step, channels, key, first, last, out); });
+    });
 }

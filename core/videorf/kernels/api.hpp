@@ -33,3 +33,37 @@ struct VideorfImages {
 struct VideorfImageGradients {
     const float *accumulated, *depth;  // either may be null
 };
+
+// The deferred shading network: matrix (out, in) and bias of each of its three layers, one after the other. `frequencies` is -1
+// where it does not look at the direction.
+struct VideorfNetwork {
+    int32_t features, frequencies, hidden;
+    const float* weights;
+};
+
+// A picture to be drawn: origins and unit directions (H, W, 3) of its pixels, and the direction along which depth is measured.
+struct VideorfView {
+    int32_t width, height;
+    const float *origins, *directions;
+    double step, transmittance_min;
+    float forward[3], background[3];
+};
+
+// image (H, W, 3), alpha (H, W), depth (H, W), infinite where nothing is.
+struct VideorfPicture {
+    float *image, *alpha, *depth;
+};
+
+// One step of Adam on `rows` rows of `channels` values (1 to 16), with the gradients of the losses between each row and its
+// `neighbors` (at most 8) in `near` (rows, neighbors; not checked; a row stands for itself where there is none) and between it and `previous`
+// (rows, channels; may be null). Bit k of `seams` (rows) says that neighbor k lies across a seam. step, rates, low, high: per channel.
+struct VideorfStep {
+    int64_t rows, count;  // `count` steps, with this one
+    int32_t channels, neighbors;
+    float *values, *mean, *square;
+    const float *gradient, *previous;
+    const int32_t* near;
+    const uint8_t* seams;
+    const float *step, *rates, *low, *high;
+    double spatial, temporal, seam, beta1, beta2, epsilon;
+};
