@@ -63,7 +63,9 @@ def remarks(metrics: dict[str, Any]) -> list[str]:
         f"{size['bytes'] / 1e6:.2f} MB on disk, {size['bytes_per_frame'] / 1e3:.1f} kB per frame, "
         f"{size['bytes_per_300_frames'] / 1e6:.1f} MB per 300 frames."
     ]
-    lines += [f"Rung {name}: {text}" for name, text in metrics.get("rungs", {}).items()]
+    measured = metrics.get("rung")
+    for name, text in metrics.get("rungs", {}).items():
+        lines.append(f"Rung {name}{' (measured)' if name == measured else ''}: {text}")
     if "speed" in metrics:
         lines.append(metrics["speed"]["sentence"])
     pooled = metrics["pooled"]

@@ -59,7 +59,8 @@ def _common(
     source: VideoReel | FieldVideo, shape: ShadingShape, size: tuple[int, int], layout: Layout
 ) -> dict[str, Any]:
     x, y, z = source.lattice.shape
-    direction = "no direction" if shape.frequencies is None else f"the direction in {shape.frequencies} frequencies"
+    waves = shape.frequencies
+    direction = "no direction" if waves is None else f"the direction in {waves} frequenc{'y' if waves == 1 else 'ies'}"
     return {
         "frames": f"{source.frame_count} from frame {source.frame_start} at {source.fps:g} fps",
         "lattice": f"{x} x {y} x {z} vertices, {source.lattice.spacing:.4g} apart",
