@@ -1,10 +1,10 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-// Included once by each width's translation unit, in a namespace of its own. Loops over channels are written so that the compiler
-// makes vectors of them where it knows how many there are; C = 0 takes any number.
+// Adam and noise, row by row. Included once by each width's translation unit, in a namespace of its own.
 #pragma once
 
 #include <cmath>
 
+#include "rows_simd.hpp"
 #include "tables.hpp"
 
 namespace holoreel {
@@ -12,76 +12,77 @@ namespace HOLOREEL_NAMESPACE {
 
 using namespace videorf;
 
-constexpr int kMaxChannels = 16;
+// Rows of `channels` values in vectors of C: the lanes behind them hold anything.
+template <int C, bool kWhole> struct Rows {
+    using Row = typename RowOf<C>::type;
+    int channels;
 
-static inline float held(float x, float low, float high) {
-    const float above = x < low ? low : x;
+    HOLOREEL_INLINE_MEMBER Row load(const float* table, int64_t row) const { return load_one(table + row * width()); }
+    HOLOREEL_INLINE_MEMBER Row load_one(const float* p) const {
+        if (kWhole) return load_row<C>(p);
+        Row row = {};
+        std::memcpy(&row, p, sizeof(float) * channels);
+        return row;
+    }
+    HOLOREEL_INLINE_MEMBER void store(float* table, int64_t row, Row value) const {
+        std::memcpy(table + row * width(), &value, sizeof(float) * width());
+    }
+    HOLOREEL_INLINE_MEMBER int width() const { return kWhole ? C : channels; }
+};
+
+template <class Row> HOLOREEL_INLINE Row held(Row x, Row low, Row high) {
+    const Row above = x < low ? low : x;
     return above > high ? high : above;
 }
 
-template <int C> void moments_of_rows(const VideorfStep& s, int64_t first, int64_t last) {
-    const int channels = C ? C : s.channels;
-    float per_step[kMaxChannels], spatial[kMaxChannels], temporal[kMaxChannels];
-    for (int c = 0; c < channels; c++) {
-        per_step[c] = 1.0f / s.step[c];
-        spatial[c] = static_cast<float>(s.spatial / (s.step[c] * static_cast<double>(s.rows)));
-        temporal[c] = static_cast<float>(s.temporal / (s.step[c] * static_cast<double>(s.rows)));
-    }
+template <int C, bool kWhole> void moments_of_rows(const VideorfStep& s, int64_t first, int64_t last) {
+    using Row = typename RowOf<C>::type;
+    const Rows<C, kWhole> rows{s.channels};
+    const double count = static_cast<double>(s.rows);
+    const Row zero = {}, one = zero + 1.0f, step = rows.load_one(s.step), per_step = one / step;
+    const Row spatial = static_cast<float>(s.spatial / count) * per_step;
+    const Row temporal = static_cast<float>(s.temporal / count) * per_step;
     const float beta1 = static_cast<float>(s.beta1), rest1 = static_cast<float>(1 - s.beta1);
     const float beta2 = static_cast<float>(s.beta2), rest2 = static_cast<float>(1 - s.beta2);
-    const float at_seam = static_cast<float>(s.seam);
+    const float weights[2] = {1.0f, static_cast<float>(s.seam)};
     const bool with_space = s.spatial != 0 && s.neighbors > 0, with_time = s.temporal != 0 && s.previous;
     for (int64_t row = first; row < last; row++) {
-        const float* here = s.values + row * channels;
-        float total[kMaxChannels];
-        for (int c = 0; c < channels; c++) total[c] = s.gradient[row * channels + c];
+        const Row here = rows.load(s.values, row);
+        Row total = rows.load(s.gradient, row);
         if (with_space) {
-            float slope[kMaxChannels] = {};
+            Row slope = zero;
             for (int k = 0; k < s.neighbors; k++) {
-                const float* there = s.values + s.near[row * s.neighbors + k] * int64_t(channels);
-                const float weight = s.seams[row] >> k & 1 ? at_seam : 1.0f;
-                for (int c = 0; c < channels; c++) slope[c] += weight * held((here[c] - there[c]) * per_step[c], -1.0f, 1.0f);
+                const Row there = rows.load(s.values, s.near[row * s.neighbors + k]);
+                slope += weights[s.seams[row] >> k & 1] * held((here - there) * per_step, -one, one);
             }
-            for (int c = 0; c < channels; c++) total[c] += spatial[c] * slope[c];
+            total += spatial * slope;
         }
-        if (with_time) {
-            const float* before = s.previous + row * channels;
-            for (int c = 0; c < channels; c++)
-                total[c] += temporal[c] * held((here[c] - before[c]) * per_step[c], -1.0f, 1.0f);
-        }
-        float *mean = s.mean + row * channels, *square = s.square + row * channels;
-        for (int c = 0; c < channels; c++) {
-            mean[c] = beta1 * mean[c] + rest1 * total[c];
-            square[c] = beta2 * square[c] + rest2 * (total[c] * total[c]);
-        }
+        if (with_time) total += temporal * held((here - rows.load(s.previous, row)) * per_step, -one, one);
+        rows.store(s.mean, row, beta1 * rows.load(s.mean, row) + rest1 * total);
+        rows.store(s.square, row, beta2 * rows.load(s.square, row) + rest2 * (total * total));
     }
 }
 
-template <int C> void move_rows(const VideorfStep& s, int64_t first, int64_t last) {
-    const int channels = C ? C : s.channels;
+template <int C, bool kWhole> void move_rows(const VideorfStep& s, int64_t first, int64_t last) {
+    using Row = typename RowOf<C>::type;
+    const Rows<C, kWhole> rows{s.channels};
     const double count = static_cast<double>(s.count);
     const float unbias = static_cast<float>(1 / std::sqrt(1 - std::pow(s.beta2, count)));
     const float epsilon = static_cast<float>(s.epsilon);
-    float rates[kMaxChannels], low[kMaxChannels], high[kMaxChannels];
-    for (int c = 0; c < channels; c++) {
-        rates[c] = static_cast<float>(s.rates[c] / (1 - std::pow(s.beta1, count)));
-        low[c] = s.low[c];
-        high[c] = s.high[c];
-    }
+    const Row rates = rows.load_one(s.rates) * static_cast<float>(1 / (1 - std::pow(s.beta1, count)));
+    const Row low = rows.load_one(s.low), high = rows.load_one(s.high);
     for (int64_t row = first; row < last; row++) {
-        float* values = s.values + row * channels;
-        const float *mean = s.mean + row * channels, *square = s.square + row * channels;
-        for (int c = 0; c < channels; c++)
-            values[c] = held(values[c] - rates[c] * mean[c] / (std::sqrt(square[c]) * unbias + epsilon), low[c], high[c]);
+        Row root = rows.load(s.square, row);
+        for (int c = 0; c < C; c++) root[c] = std::sqrt(root[c]);
+        const Row moved = rows.load(s.values, row) - rates * rows.load(s.mean, row) / (root * unbias + epsilon);
+        rows.store(s.values, row, held(moved, low, high));
     }
 }
 
 // The numbers are Wellons' "lowbias32" of their place in the table: they hang on nothing else.
-template <int C>
-void noise_rows(const float* rows, const float* step, int32_t channels, uint32_t key, int64_t first, int64_t last, float* out) {
-    if (C) channels = C;
-    float steps[kMaxChannels];
-    for (int c = 0; c < channels; c++) steps[c] = step[c];
+template <int C, bool kWhole>
+void noise_rows(const float* values, const float* step, int32_t channels, uint32_t key, int64_t first, int64_t last, float* out) {
+    if (kWhole) channels = C;
     for (int64_t row = first; row < last; row++) {
         const uint32_t at = static_cast<uint32_t>(row * channels);
         for (int c = 0; c < channels; c++) {
@@ -90,17 +91,20 @@ void noise_rows(const float* rows, const float* step, int32_t channels, uint32_t
             x = (x ^ x >> 15) * 0x846CA68Bu;
             x ^= x >> 16;
             const float share = (static_cast<float>(static_cast<int32_t>(x >> 8)) + 0.5f) * (1.0f / (1 << 24)) - 0.5f;
-            out[row * channels + c] = rows[row * channels + c] + steps[c] * share;
+            out[row * channels + c] = values[row * channels + c] + step[c] * share;
         }
     }
 }
 
+template <int C, bool kWhole> const TableKernels* table_kernels_of() {
+    static const TableKernels kernels = {moments_of_rows<C, kWhole>, move_rows<C, kWhole>, noise_rows<C, kWhole>};
+    return &kernels;
+}
+
 static const TableKernels* tables_of(int channels) {
-    static const TableKernels any = {moments_of_rows<0>, move_rows<0>, noise_rows<0>};
-    static const TableKernels four = {moments_of_rows<4>, move_rows<4>, noise_rows<4>};
-    static const TableKernels eight = {moments_of_rows<8>, move_rows<8>, noise_rows<8>};
-    static const TableKernels sixteen = {moments_of_rows<16>, move_rows<16>, noise_rows<16>};
-    return channels == 4 ? &four : channels == 8 ? &eight : channels == 16 ? &sixteen : &any;
+    if (channels <= 4) return channels == 4 ? table_kernels_of<4, true>() : table_kernels_of<4, false>();
+    if (channels <= 8) return channels == 8 ? table_kernels_of<8, true>() : table_kernels_of<8, false>();
+    return channels == 16 ? table_kernels_of<16, true>() : table_kernels_of<16, false>();
 }
 
 }  // namespace HOLOREEL_NAMESPACE
