@@ -68,7 +68,7 @@ class Player(ABC):
             )
         return [float(frame) for frame in range(start, end + 1)]
 
-    def missing(self) -> range | list[int]:
+    def missing(self) -> list[int]:
         """Return the frames of the timeline that cannot be drawn, because a file was cut off."""
         return []
 

@@ -15,7 +15,7 @@ COMMANDS = {
     "train": "train a reel from a capture",
     "render": "render a reel, PLY or .splatv from given cameras",
     "eval": "measure a reel against the held-out views of its capture",
-    "export": "write a reel for other programs (splatv, 3D Gaussian PLY, the authors' files), or smaller",
+    "export": "write a reel for other programs (splatv, 3D Gaussian PLY, points, the authors' files), or smaller",
     "info": "say what a reel, PLY, .splatv or capture holds, and what is wrong with it",
     "demo": "take a scene through the whole loop and write a report",
     "convert": "write a capture in the layout of another dataset",

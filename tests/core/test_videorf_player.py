@@ -11,6 +11,7 @@ from holoreel.core.draw import open_player
 from holoreel.core.errors import HoloreelError
 from holoreel.core.gaussians.player import GaussianPlayer
 from holoreel.core.metrics import psnr
+from holoreel.core.reel import VIDEORF, reel_kind
 from holoreel.core.videorf import decode
 from holoreel.core.videorf.decode import DecodedVideo, find_rung, frames_text
 from holoreel.core.videorf.draw import QUALITY
@@ -213,6 +214,16 @@ def test_frames_in_words():
     assert frames_text([7]) == "frame 7"
     assert frames_text([7, 8]) == "frames 7 to 8"
     assert frames_text([1, 2, 3, 5, 9, 10]) == "frames 1 to 3, 5, 9 to 10"
+
+
+def test_kinds_of_reels_are_told_apart(played, recording, tmp_path):
+    assert reel_kind(played[1].path) == VIDEORF
+    assert reel_kind(recording.reel) == "spacetime_gaussians"
+    (tmp_path / "a.reel").write_text('{"kind": ["videorf"]}')
+    assert reel_kind(tmp_path / "a.reel") == reel_kind(tmp_path) == reel_kind(recording.reel.with_suffix(".ply")) == ""
+    for path in (tmp_path / "a.reel", tmp_path / "none.reel", tmp_path):
+        with pytest.raises(HoloreelError, match=str(path)):
+            open_player(path)
 
 
 def test_every_file_finds_its_player(played, recording, tmp_path):
