@@ -5,6 +5,7 @@ import json
 import math
 import subprocess
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -97,6 +98,33 @@ def test_subjects_are_measured_over_white_and_over_their_masks(filmed):
     assert metrics["pooled"]["psnr_mask"] == pytest.approx(-10 * math.log10(np.mean(inner)), abs=0.02)
     assert metrics["pooled_cameras"]["side"]["psnr"] == pytest.approx(-10 * math.log10(np.mean(errors[1::3])), abs=0.02)
     assert metrics["size"]["bytes_per_frame"] == 200
+
+
+def test_surroundings_count_where_they_are_drawn(tmp_path):
+    """Pictures with surroundings and masks: who shows the subject alone is compared with it alone, others with all."""
+    random = np.random.default_rng(2)
+    picture = random.integers(0, 256, (24, 32, 3)) / 255
+    half = np.zeros((24, 32, 3))
+    half[:, 16:] = 1
+    write_png(tmp_path / "picture.png", picture)
+    write_png(tmp_path / "mask.png", half)
+    view, camera = ("a", 0), Camera.look_at((0, -3, 0), (0, 0, 0), width=32, height=24, fx=30)
+    plain = Capture({"a": camera}, {view: tmp_path / "picture.png"}, 1, frame_start=101, source=tmp_path)
+    masked = replace(plain, masks={view: tmp_path / "mask.png"})
+    alone, all_of_it = Gray(tmp_path), Gray(tmp_path)
+    all_of_it.subject_alone = False
+    right = -10 * math.log10(np.square(picture[:, 16:] - 0.5).mean())
+    cut = -10 * math.log10(np.square(np.where(half > 0, picture, 1.0) - 0.5).mean())
+    full = -10 * math.log10(np.square(picture - 0.5).mean())
+    for player, capture, psnr, inside in (
+        (alone, masked, cut, right),
+        (all_of_it, masked, full, right),
+        (alone, plain, full, None),
+        (all_of_it, plain, full, None),
+    ):
+        mean = evaluate_player(player, capture, "train")["mean"]
+        assert mean["psnr"] == pytest.approx(psnr, abs=1e-4)
+        assert mean.get("psnr_mask") == (None if inside is None else pytest.approx(inside, abs=1e-4))
 
 
 def test_networks_see_the_whole_and_the_subjects_box(filmed, monkeypatch):
