@@ -30,7 +30,8 @@ from .views import FrameViews
 UNKNOWN_COLOR = 0.5  # of vertices that were not trained
 START_DENSITY = 0.0  # the hull is half-solid at first
 REPORT_EVERY = 20  # steps
-LOWEST, HIGHEST = -12.0, 16.0  # raw densities stay between
+HIGHEST = 16.0  # raw densities lie between EMPTY_DENSITY and this
+EPSILON = 1e-8  # Adam's: with less, vertices that hardly any ray meets move as much as the others, and haze remains
 SMOOTH_STEPS = (1.0, 0.1, 0.1, 0.1)  # differences of density and color that total variation takes for large
 
 Grid = NDArray[np.float32]
@@ -162,15 +163,15 @@ class CoarseConfig:
     """steps"""
     rays: int = 4096
     """pixels that a step looks at"""
-    density_rate: float = 0.35
+    density_rate: float = 0.7
     """Adam's step for raw densities"""
-    color_rate: float = 0.08
+    color_rate: float = 0.03
     """Adam's step for colors"""
     final_rate: float = 0.1
     """both rates decay to this part of themselves"""
     entropy: float = 0.01
     """weight of the background's entropy: rays shall be either stopped or free"""
-    smooth: float = 0.0
+    smooth: float = 2e-4
     """weight of the total variation in space"""
     misses: int = 0
     """masks that may leave out a vertex of the visual hull"""
@@ -233,9 +234,9 @@ def _optimized(
     """Return the rows (N + 1, 4) [raw density, color]: color is what the march sums, without any activation."""
     rows = torch.tensor([START_DENSITY, *[UNKNOWN_COLOR] * 3]).repeat(volume.field.rows, 1)
     rows[-1] = torch.tensor([EMPTY_DENSITY, 0.0, 0.0, 0.0])
-    low, high = torch.tensor([LOWEST, 0.0, 0.0, 0.0]), torch.tensor([HIGHEST, 1.0, 1.0, 1.0])
+    low, high = torch.tensor([EMPTY_DENSITY, 0.0, 0.0, 0.0]), torch.tensor([HIGHEST, 1.0, 1.0, 1.0])
     neighbors = lattice_neighbors(volume.field.lookup)
-    optimizer = TableOptimizer(neighbors, rows, torch.tensor(SMOOTH_STEPS), low, high)
+    optimizer = TableOptimizer(neighbors, rows, torch.tensor(SMOOTH_STEPS), low, high, epsilon=EPSILON)
     rates = torch.tensor([config.density_rate, *[config.color_rate] * 3])
     generator = torch.Generator().manual_seed(seed)
     for iteration in range(config.iterations):

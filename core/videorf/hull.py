@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from .views import FrameViews
 
 REACH = 1.75  # spacings: no corner of a cell lies farther from a point in it than √3
+BLOCK = 1 << 14  # vertices projected at once, whose temporaries fit a processor's cache
 MIN_CAMERAS = 3  # that must see a vertex: where fewer look, nothing is carved and nothing is known
 
 
@@ -74,15 +75,17 @@ def _judge(
     from scipy.ndimage import distance_transform_edt
 
     camera, mask = seen.camera, seen.mask
-    positions = lattice.positions(np.stack(np.unravel_index(vertices, lattice.shape), 1))
-    pixels, depth = camera.project(positions)
-    with np.errstate(invalid="ignore"):
-        place = np.floor(pixels)
-        inside = (depth > 0) & ((place >= 0) & (place < (camera.width, camera.height))).all(1)  # False for NaN, too
-    column, row = place[inside].astype(int).T
     # The distance to the middle of the nearest pixel that is set; half a diagonal more on both sides.
     distance = distance_transform_edt(~mask) if mask.any() else np.full(mask.shape, np.inf)
-    radius = reach * lattice.spacing * max(camera.fx, camera.fy) / depth[inside] + 1.5
-    near = np.zeros(len(vertices), bool)
-    near[inside] = distance[row, column] <= radius
+    length = reach * lattice.spacing * max(camera.fx, camera.fy)
+    inside, near = np.zeros((2, len(vertices)), bool)
+    for start in range(0, len(vertices), BLOCK):
+        part = slice(start, start + BLOCK)
+        pixels, depth = camera.project(lattice.positions(np.stack(np.unravel_index(vertices[part], lattice.shape), 1)))
+        with np.errstate(invalid="ignore"):
+            place = np.floor(pixels)
+            visible = (depth > 0) & ((place >= 0) & (place < (camera.width, camera.height))).all(1)  # not for NaN
+        column, row = place[visible].astype(int).T
+        inside[part] = visible
+        near[part][visible] = distance[row, column] <= length / depth[visible] + 1.5
     return inside, near
