@@ -78,7 +78,7 @@ public:
                 hit = hit && o[a] >= 0 && o[a] <= volume.cells[a];
                 continue;
             }
-            const double first = (0 - o[a]) / d, second = (volume.cells[a] - o[a]) / d;
+            const double inverse = 1 / d, first = -o[a] * inverse, second = (volume.cells[a] - o[a]) * inverse;
             near = std::max(near, std::min(first, second));
             far = std::min(far, std::max(first, second));
         }
