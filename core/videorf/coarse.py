@@ -171,7 +171,7 @@ class CoarseConfig:
     """both rates decay to this part of themselves"""
     entropy: float = 0.01
     """weight of the background's entropy: rays shall be either stopped or free"""
-    smooth: float = 2e-4
+    smooth: float = 3e-4
     """weight of the total variation in space"""
     misses: int = 0
     """masks that may leave out a vertex of the visual hull"""
