@@ -60,10 +60,10 @@ def _without_reel(model: FieldVideo, coding: Coding, ranges: Ranges, path: Path)
     counts = [1] * len(frames) if coding.heads == "frames" else [len(frames)]
     written = write_reel(model, path, [RungSpec(coding.qps[-1], coding.codec)], profile_of(model), ranges=ranges)
     others = reel_size(written)
-    settings = {"fps": model.fps, "codec": coding.codec, "meaning": written.meaning}
     for qp in coding.qps:
         file = path.with_suffix(".mp4")
-        coded = encode_video(file, lumas_of(model, ranges, tiling), counts, qp=qp, **settings)
+        lumas = lumas_of(model, ranges, tiling)
+        coded = encode_video(file, lumas, counts, fps=model.fps, qp=qp, codec=coding.codec, meaning=written.meaning)
         video = FeatureVideo(file, coded, tiling.picture, written.meaning)
         codes = (model.table_of(frame).to_rows(tiling.unpack(video.luma(frame))) for frame in frames)
         decoded = replace(model, ranges=ranges, load=in_memory([ranges.decode(part) for part in codes]))
