@@ -3,6 +3,7 @@
 
 import pytest
 from holoreel.core.errors import HoloreelError
+from holoreel.core.videorf.codec import CODECS
 from holoreel.core.videorf.encode import RungSpec, decoded_rows, lumas_of, reel_size, round_trip, write_reel
 from holoreel.core.videorf.package import read_video_reel
 from holoreel.core.videorf.quantize import Ranges
@@ -58,7 +59,7 @@ def test_sizes_are_those_of_the_files(encoded):
     assert {path.name for path in folder.iterdir()} == {*names, "ball.qp8.mp4", "ball.qp30.mp4"}
 
 
-@pytest.mark.parametrize("codec", ["h264", "hevc"])
+@pytest.mark.parametrize("codec", CODECS)
 def test_a_round_trip_in_memory_is_that_of_the_reel(encoded, tmp_path, codec):
     model, _ = encoded
     reel = write_reel(model, tmp_path / "a.reel", [RungSpec(28, codec)])
@@ -106,8 +107,6 @@ def test_models_that_cannot_be_encoded_are_refused(encoded, tmp_path):
 
 
 def test_missing_encoders_are_named(encoded, tmp_path, monkeypatch):
-    from holoreel.core.videorf.codec import CODECS
-
     monkeypatch.setitem(CODECS, "hevc", CODECS["hevc"]._replace(encoder="libnone"))
     with pytest.raises(HoloreelError, match="PyAV has no libnone here"):
         write_reel(encoded[0], tmp_path / "a.reel", [RungSpec(20, "hevc")])
