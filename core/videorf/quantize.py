@@ -54,7 +54,10 @@ class Ranges:
 
     def decode(self, codes: NDArray[np.uint8]) -> NDArray[np.float32]:
         """Return the rows (..., C) that codes stand for. Every player computes in float32: low + code * step."""
-        return np.array(self.low, np.float32) + codes.astype(np.float32) * self.step
+        rows = codes.astype(np.float32)
+        rows *= self.step
+        rows += np.array(self.low, np.float32)
+        return rows
 
 
 def fit_ranges(
