@@ -1,19 +1,27 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""How fast the ray march is, compiled and in torch: samples per second on a hollow figure seen from around it."""
+"""How fast the ray march, training and drawing are, on a hollow figure seen from around it."""
 
 import time
 from collections.abc import Callable
+from functools import partial
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
 import torch
 
+from ..camera import Camera
 from . import reference
+from .deferred import DeferredShading, composite
+from .draw import QUALITY, draw_field
 from .field import FieldLattice, MarchRules, Rays
-from .mapping import build_table
+from .losses import rgb_loss
+from .mapping import MappingTable, build_table
 from .march import Volume, count_samples, march
 from .native import get_threads
 from .occupancy import Lattice, dilate
+from .optimize import TableOptimizer, noisy_rows
+from .shading import ShadingShape
 
 
 class MarchSpeed(NamedTuple):
@@ -31,11 +39,28 @@ class MarchSpeed(NamedTuple):
     twin_ratio: float
 
 
+class StepSpeed(NamedTuple):
+    """Milliseconds of a training step, and of its parts: the noise, the march, the network with the loss, the way back
+    through all of it, and the optimizer.
+    """
+
+    noise: float
+    march: float
+    network: float
+    backward: float
+    optimizer: float
+
+    @property
+    def total(self) -> float:
+        """The whole step."""
+        return sum(self)
+
+
 def bench_march(
     edge: int = 96, channels: int = 8, rays: int = 8192, twin_rays: int = 512, repeats: int = 5, seed: int = 0
 ) -> MarchSpeed:
     """Measure on a lattice of `edge` vertices per side; the best of `repeats` runs each."""
-    field, table, bundle = _scene(edge, channels, rays, seed)
+    field, _, table, bundle = _scene(edge, channels, rays, seed)
     volume, rules = Volume(field), MarchRules()
     part = Rays(*(values[:twin_rays] for values in bundle if values is not None))
     samples, twin_samples = count_samples(volume, table, bundle), count_samples(volume, table, part)
@@ -65,7 +90,50 @@ def bench_march(
     )
 
 
-def _scene(edge: int, channels: int, count: int, seed: int) -> tuple[FieldLattice, torch.Tensor, Rays]:
+def bench_step(edge: int = 128, channels: int = 8, rays: int = 4096, repeats: int = 9, seed: int = 0) -> StepSpeed:
+    """Measure one training step's parts on a lattice of `edge` vertices per side; the best of `repeats` each."""
+    field, mapping, table, bundle = _scene(edge, channels, rays, seed)
+    volume, network = Volume(field), DeferredShading(ShadingShape(channels - 1), torch.Generator().manual_seed(seed))
+    quantum, wide = torch.full((channels,), 0.05), torch.full((channels,), 50.0)
+    optimizer = TableOptimizer(mapping, table, quantum, -wide, wide, table[:-1] + 0.01)
+    rates, truth, seen = torch.full((channels,), 0.01), torch.rand(rays, 3), torch.empty_like(table)
+    times: list[list[float]] = []
+    before = torch.get_num_threads()
+    try:
+        torch.set_num_threads(1)
+        for repeat in range(repeats):
+            marks = [time.perf_counter()]
+            leaf = noisy_rows(table, quantum, repeat, seen).detach().requires_grad_()
+            marks.append(time.perf_counter())
+            marched = march(volume, leaf, bundle)
+            marks.append(time.perf_counter())
+            colors = composite(network(marched.features, bundle.directions), marched.transmittance, 1.0)
+            loss = rgb_loss(colors, truth)
+            marks.append(time.perf_counter())
+            loss.backward()
+            marks.append(time.perf_counter())
+            assert leaf.grad is not None
+            optimizer.step(leaf.grad, rates, 1e-5, 1e-5)
+            marks.append(time.perf_counter())
+            times.append([1e3 * (after - mark) for mark, after in pairwise(marks)])
+    finally:
+        torch.set_num_threads(before)
+    return StepSpeed(*(min(part) for part in zip(*times, strict=True)))
+
+
+def bench_drawing(edge: int = 128, width: int = 320, height: int = 180, repeats: int = 5) -> dict[str, float]:
+    """Return the milliseconds of a picture that the figure fills, per quality; the best of `repeats` each."""
+    field, _, table, _ = _scene(edge, 8, 1, 0)
+    volume = Volume(field)
+    shading = DeferredShading(ShadingShape(7), torch.Generator().manual_seed(0)).numbers()
+    camera = Camera.look_at((3.0, 0.3, 0.4), (0.0, 0.0, 0.0), width=width, height=height, fx=2.2 * width)
+    return {
+        name: 1e3 * _best(partial(draw_field, volume, table, shading, camera, rules), repeats)
+        for name, rules in QUALITY.items()
+    }
+
+
+def _scene(edge: int, channels: int, count: int, seed: int) -> tuple[FieldLattice, MappingTable, torch.Tensor, Rays]:
     random = np.random.default_rng(seed)
     axis = np.linspace(-1, 1, edge)
     grid = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), -1)
@@ -83,7 +151,7 @@ def _scene(edge: int, channels: int, count: int, seed: int) -> tuple[FieldLattic
     directions = random.uniform(-1, 1, (count, 3)) * [0.45, 0.5, 0.9] - origins
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     arrays = (origins.astype(np.float32), directions.astype(np.float32), random.random(count, dtype=np.float32))
-    return field, torch.from_numpy(table), Rays(*map(torch.from_numpy, arrays))
+    return field, mapping, torch.from_numpy(table), Rays(*map(torch.from_numpy, arrays))
 
 
 def _best(run: Callable[[], object], repeats: int) -> float:

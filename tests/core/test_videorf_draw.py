@@ -7,13 +7,22 @@ import numpy as np
 import pytest
 import torch
 from holoreel.core.camera import Camera
-from holoreel.core.videorf import reference
+from holoreel.core.errors import HoloreelError
+from holoreel.core.videorf import native, reference
 from holoreel.core.videorf.deferred import DeferredShading
 from holoreel.core.videorf.draw import QUALITY, camera_rays, draw_field, draw_field_torch
 from holoreel.core.videorf.field import FieldLattice, MarchRules, Rays
 from holoreel.core.videorf.march import Volume
 from holoreel.core.videorf.occupancy import Lattice, dilate
 from holoreel.core.videorf.shading import ShadingShape, composite
+
+
+@pytest.fixture(autouse=True)
+def as_before():
+    threads = native.get_threads()
+    yield
+    native.set_threads(threads)
+    native.set_lanes(0)
 
 
 def scene(channels=8, frequencies=1, hidden=16, seed=0):
@@ -68,6 +77,37 @@ def test_a_picture_is_march_and_shading(channels, frequencies, hidden, rules):
         assert (np.isinf(drawn.depth) == (drawn.alpha == 0)).all()
         assert abs(drawn.depth.ravel()[solid] / z[solid] - 1).max() < 1e-4
     assert 50 < solid.sum() < 37 * 23 - 50
+
+
+def test_bits_do_not_hang_on_the_number_of_threads():
+    field, table, shading = scene()
+    pictures = []
+    for threads in (1, 2, 5):
+        native.set_threads(threads)
+        drawn = draw_field(Volume(field), table, shading, camera())
+        pictures.append(b"".join(part.tobytes() for part in drawn))
+    assert len(set(pictures)) == 1
+
+
+@pytest.mark.parametrize("lanes", [4, 8])
+def test_narrow_and_wide_kernels_draw_alike(lanes):
+    field, table, shading = scene(frequencies=8)
+    best = draw_field(Volume(field), table, shading, camera())
+    try:
+        native.set_lanes(lanes)
+    except HoloreelError:
+        pytest.skip(f"no {lanes} lanes here")
+    drawn = draw_field(Volume(field), table, shading, camera())
+    assert abs(drawn.image - best.image).max() < 1e-5
+    assert abs(drawn.alpha - best.alpha).max() < 1e-5
+
+
+def test_networks_of_other_tables_are_refused():
+    field, table, shading = scene(8)
+    with pytest.raises(HoloreelError, match="other features than the table"):
+        draw_field(Volume(field), table[:, :3].contiguous(), shading, camera())
+    with pytest.raises(HoloreelError, match="must lie in"):
+        draw_field(Volume(field), table, shading, camera(), MarchRules(0.0))
 
 
 def test_depth_is_planar():

@@ -4,6 +4,8 @@
 import numpy as np
 import pytest
 import torch
+from holoreel.core.errors import HoloreelError
+from holoreel.core.videorf import native, reference
 from holoreel.core.videorf.losses import spatial_loss, temporal_loss
 from holoreel.core.videorf.mapping import LAYOUTS, build_table
 from holoreel.core.videorf.optimize import (
@@ -14,6 +16,15 @@ from holoreel.core.videorf.optimize import (
     lattice_neighbors,
     noisy_rows,
 )
+
+
+@pytest.fixture(autouse=True)
+def as_before():
+    threads = native.get_threads()
+    yield
+    native.set_threads(threads)
+    native.set_lanes(0)
+
 
 STEP = torch.tensor([0.1, 0.02, 0.03, 0.04])
 RATES = torch.tensor([0.2, 0.05, 0.01, 0.03])
@@ -27,6 +38,13 @@ def table_of(layout="blocks", shape=(20, 17, 19), share=0.4, seed=0):
 def rows_of(mapping, seed=1):
     generator = torch.Generator().manual_seed(seed)
     return torch.randn(mapping.count + 1, 4, generator=generator) * STEP * 2
+
+
+def lanes_or_skip(lanes):
+    try:
+        native.set_lanes(lanes)
+    except HoloreelError:
+        pytest.skip(f"no {lanes} lanes here")
 
 
 @pytest.mark.parametrize("seam", [1.0, 0.25])
@@ -64,6 +82,45 @@ def test_steps_are_those_of_adam_on_the_losses(layout, seam):
     assert ((truth == high) | (truth == low)).any()
     assert torch.allclose(rows[:-1].double(), truth, rtol=0, atol=2e-5)
     assert (rows[-1] == last).all()
+
+
+@pytest.mark.parametrize("lanes", [4, 8])
+@pytest.mark.parametrize("channels", [2, 4, 7, 8, 13, 16])
+@pytest.mark.parametrize("space", [False, True])
+def test_kernels_are_the_twin(channels, lanes, space):
+    lanes_or_skip(lanes)
+    mapping = table_of()
+    neighbors = lattice_neighbors(mapping.lookup()) if space else image_neighbors(mapping)
+    generator = torch.Generator().manual_seed(channels)
+    step, rates = torch.rand(channels, generator=generator) + 0.1, torch.rand(channels, generator=generator) * 0.1
+    rows = torch.randn(mapping.count + 1, channels, generator=generator)
+    previous = rows[:-1] + torch.randn(mapping.count, channels, generator=generator) * step
+    start, exact, wide = rows.double(), rows.double(), torch.full((channels,), 1.5)
+    mine = TableOptimizer(neighbors, rows, step, -wide, wide, previous)
+    twin = reference.TableOptimizer(neighbors, exact, step, -wide, wide, previous)
+    for _ in range(4):
+        gradient = torch.randn(rows.shape, generator=generator) * 1e-3
+        for optimizer in (mine, twin):
+            optimizer.step(gradient, rates, 0.5, 0.3, 0.4)
+    # Adam makes full steps of gradients that are nearly 0: single values may differ by more than rounding.
+    assert (rows - exact).norm() < 1e-5 * (exact - start).norm()
+    assert torch.allclose(
+        noisy_rows(rows, step, 2**40 + 5).double(), reference.noisy_rows(rows.double(), step, 2**40 + 5), atol=1e-6
+    )
+
+
+def test_bits_do_not_hang_on_the_number_of_threads():
+    mapping, results = table_of(shape=(33, 40, 40), share=0.05), []
+    mapping = build_table(mapping.occupancy() | np.roll(mapping.occupancy(), 1, 0), (128, 128))
+    for threads in (1, 2, 5):
+        native.set_threads(threads)
+        rows, previous, wide = rows_of(mapping), rows_of(mapping, 2)[:-1], torch.full((4,), 9.0)
+        optimizer = TableOptimizer(mapping, rows, STEP, -wide, wide, previous)
+        for _ in range(3):
+            optimizer.step(rows_of(mapping, 3), RATES, 0.1, 0.1, 0.5)
+        results.append(rows.numpy().tobytes() + noisy_rows(rows, STEP, 3).numpy().tobytes())
+    assert mapping.count > 4096  # more than one thread has something to do
+    assert len(set(results)) == 1
 
 
 def test_first_frames_have_no_rows_before():
@@ -130,3 +187,13 @@ def test_what_does_not_fit_is_refused():
         TableOptimizer(mapping, rows[:-1], STEP, -wide, wide)
     with pytest.raises(ValueError, match="the rows before"):
         TableOptimizer(mapping, rows, STEP, -wide, wide, rows)
+    with pytest.raises(ValueError, match="they change in place"):
+        TableOptimizer(mapping, rows.double(), STEP, -wide, wide)
+    neighbors = image_neighbors(mapping)
+    neighbors.rows[3, 1] = mapping.count
+    with pytest.raises(ValueError, match="rows of the table"):
+        TableOptimizer(neighbors, rows, STEP, -wide, wide)
+    with pytest.raises(ValueError, match="the gradient is"):
+        TableOptimizer(mapping, rows, STEP, -wide, wide).step(rows[:-1], RATES)
+    with pytest.raises(ValueError, match="the noisy rows need"):
+        noisy_rows(rows, STEP, 1, rows[:-1])
