@@ -31,7 +31,6 @@ UNKNOWN_COLOR = 0.5  # of vertices that were not trained
 START_DENSITY = 0.0  # the hull is half-solid at first
 REPORT_EVERY = 20  # steps
 HIGHEST = 16.0  # raw densities lie between EMPTY_DENSITY and this
-EPSILON = 1e-8  # Adam's: with less, vertices that hardly any ray meets move as much as the others, and haze remains
 SMOOTH_STEPS = (1.0, 0.1, 0.1, 0.1)  # differences of density and color that total variation takes for large
 
 Grid = NDArray[np.float32]
@@ -236,7 +235,7 @@ def _optimized(
     rows[-1] = torch.tensor([EMPTY_DENSITY, 0.0, 0.0, 0.0])
     low, high = torch.tensor([EMPTY_DENSITY, 0.0, 0.0, 0.0]), torch.tensor([HIGHEST, 1.0, 1.0, 1.0])
     neighbors = lattice_neighbors(volume.field.lookup)
-    optimizer = TableOptimizer(neighbors, rows, torch.tensor(SMOOTH_STEPS), low, high, epsilon=EPSILON)
+    optimizer = TableOptimizer(neighbors, rows, torch.tensor(SMOOTH_STEPS), low, high)
     rates = torch.tensor([config.density_rate, *[config.color_rate] * 3])
     generator = torch.Generator().manual_seed(seed)
     for iteration in range(config.iterations):
