@@ -1,26 +1,23 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Where the time of a played VideoRF frame goes: decode, unpack, render, and the rest (the paper's Table 2)."""
 
-import time
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, get_args
 
-import numpy as np
-
 from ..camera import Camera
 from ..draw import Quality
 from ..render import Backend
 from ..videorf.player import VideoPlayer
+from .play import measure_play
 
-PASSES = 3
-PARTS = {"decode": "decode", "unpack": "unpack", "draw": "render"}  # the player's names, and the table's
+PARTS = ("decode", "unpack", "draw")  # as the player calls what the table does: decode, unpack, render
 
 
 @dataclass(frozen=True)
 class Split:
-    """Milliseconds per frame, means over all frames of the quickest of several passes, each by a player that is new.
+    """Milliseconds per frame, means over all frames of several passes.
 
     `rest` is what remains of the whole: above all a group's lattice, made ready once per group.
     """
@@ -49,37 +46,20 @@ class Split:
         return asdict(self) | {"fps": self.fps, "overlapped_fps": self.overlapped_fps}
 
 
-def measure_splits(
-    reel: Path, camera: Camera, rung: int | str | None = None, backend: Backend = "auto", passes: int = PASSES
-) -> list[Split]:
+def measure_splits(reel: Path, camera: Camera, rung: int | str | None = None, backend: Backend = "auto") -> list[Split]:
     """Play all frames in order as a camera sees them, in every quality."""
-    return [measure_split(reel, camera, rung, quality, backend, passes) for quality in get_args(Quality)]
+    return [measure_split(reel, camera, rung, quality, backend) for quality in get_args(Quality)]
 
 
 def measure_split(
-    reel: Path,
-    camera: Camera,
-    rung: int | str | None = None,
-    quality: Quality = "full",
-    backend: Backend = "auto",
-    passes: int = PASSES,
+    reel: Path, camera: Camera, rung: int | str | None = None, quality: Quality = "full", backend: Backend = "auto"
 ) -> Split:
     """Play all frames in order as a camera sees them."""
-    first = VideoPlayer(reel, rung, quality, backend)
-    first.draw(camera, 0.0)  # loads libraries
-    best = min((_play(VideoPlayer(reel, rung, quality, backend), camera) for _ in range(passes)), key=sum)
-    return Split(camera.width, camera.height, first.facts()["rung"], quality, *best)
-
-
-def _play(player: VideoPlayer, camera: Camera) -> list[float]:
-    rows = []
-    for index in range(player.frame_count):
-        start = time.perf_counter()
-        player.draw(camera, float(player.frame_start + index))
-        whole = time.perf_counter() - start
-        parts = [player.seconds.get(name, 0.0) for name in PARTS]
-        rows.append([*parts, whole - sum(parts)])
-    return (1000 * np.mean(rows, axis=0)).tolist()
+    player = VideoPlayer(reel, rung, quality, backend)
+    played = measure_play(player, camera)
+    parts = [played["milliseconds"].get(name, 0.0) for name in PARTS]
+    rest = max(1000 / played["fps"] - sum(parts), 0.0)
+    return Split(camera.width, camera.height, player.facts()["rung"], quality, *parts, rest)
 
 
 def table(splits: Sequence[Split]) -> list[tuple[str, ...]]:
