@@ -12,10 +12,10 @@ from ..capture.images import composite
 from ..files import write_json
 from ..report import Picture, Report, Section, Table, write_report
 from ..report.figures import plot_curves
+from . import split
 from .ablation import as_text, shown_view, write_crops
 from .bdrate import rate_at
 from .split import Split
-from .split import table as split_table
 from .variants import FULL
 from .videorf import Finished, compare, score
 
@@ -144,7 +144,7 @@ def write_results(
     The pictures are of the middle rung of every row, of different sizes: bytes stand beside them.
     """
     found = {key: as_dict(rows, key) for key in rows}
-    speed = [split.as_dict() for split in splits]
+    speed = [part.as_dict() for part in splits]
     write_json(out / "videorf.json", {"machine": hardware, "rows": found, "speed": speed})
     full = rows[FULL]
     measures = [name for name in MEASURES if name in full.model["mean"]]
@@ -162,7 +162,7 @@ def write_results(
             "Rows", " ".join((LEGEND, RULE, *remarks(full))), (crops,), (figure,), Table(lines[0], tuple(lines[1:]))
         ),
         _section("PSNR by the place in a group", positions(full)),
-        *([_section(speed_title(splits[0]), split_table(splits))] if splits else []),
+        *([_section(split.title(splits), split.table(splits))] if splits else []),
         *(_section(f"Rungs of {row.variant.key}: {row.variant.title}", ladder(row)) for row in rows.values()),
     ]
     intro = (
@@ -200,13 +200,8 @@ def text(rows: dict[str, Finished], splits: Sequence[Split] = ()) -> str:
     """Return what is printed: the table of rows, the full method's rungs, the sentences, and how fast it plays."""
     parts = [as_text(overview(rows)), as_text(ladder(rows[FULL])), "\n".join([*remarks(rows[FULL]), LEGEND, RULE])]
     if splits:
-        parts.append(f"{speed_title(splits[0])}\n{as_text(split_table(splits))}")
+        parts.append(split.describe(splits))
     return "\n\n".join(parts)
-
-
-def speed_title(split: Split) -> str:
-    """Return what stands over the table of where a played frame's time goes."""
-    return f"Playing rung {split.rung} at {split.width}x{split.height}"
 
 
 def _compared(reference: Finished, other: Finished, measure: str) -> Any:

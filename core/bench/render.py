@@ -72,7 +72,7 @@ def measure(
 
     `decoder_output` is as in `core.reel.load_gaussians`.
     """
-    camera = view if isinstance(view, Camera) else _camera(view)
+    camera = view if isinstance(view, Camera) else view_camera(view)
     return measure_player(GaussianPlayer(path, backend, decoder_output), camera.scaled(*size) if size else camera)
 
 
@@ -121,7 +121,8 @@ def _same(one: Drawing, other: Drawing) -> bool:
     return all(np.array_equal(a, b) for a, b in zip(one, other, strict=True))
 
 
-def _camera(view: Path) -> Camera:
+def view_camera(view: Path) -> Camera:
+    """Return the camera of a CAMERA.json, or a capture's first one that is held out."""
     if view.is_file() and view.suffix == ".json" and view.name != "transforms.json":
         return read_camera(view)
     capture = read_capture(view)

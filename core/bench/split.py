@@ -10,6 +10,7 @@ from ..camera import Camera
 from ..draw import Quality
 from ..render import Backend
 from ..videorf.player import VideoPlayer
+from .ablation import as_text
 from .play import measure_play
 
 PARTS = ("decode", "unpack", "draw")  # as the player calls what the table does: decode, unpack, render
@@ -57,9 +58,9 @@ def measure_split(
     """Play all frames in order as a camera sees them."""
     player = VideoPlayer(reel, rung, quality, backend)
     played = measure_play(player, camera)
-    parts = [played["milliseconds"].get(name, 0.0) for name in PARTS]
-    rest = max(1000 / played["fps"] - sum(parts), 0.0)
-    return Split(camera.width, camera.height, player.facts()["rung"], quality, *parts, rest)
+    decode, unpack, render = (played["milliseconds"].get(name, 0.0) for name in PARTS)
+    rest = max(1000 / played["fps"] - decode - unpack - render, 0.0)
+    return Split(camera.width, camera.height, player.facts()["rung"], quality, decode, unpack, render, rest)
 
 
 def table(splits: Sequence[Split]) -> list[tuple[str, ...]]:
@@ -67,3 +68,13 @@ def table(splits: Sequence[Split]) -> list[tuple[str, ...]]:
     columns = ("decode", "unpack", "render", "rest", "fps", "overlapped_fps")
     heading = ("quality", "decode ms", "unpack ms", "render ms", "rest ms", "FPS", "FPS, decoding beside")
     return [heading, *((split.quality, *(f"{getattr(split, name):.1f}" for name in columns)) for split in splits)]
+
+
+def title(splits: Sequence[Split]) -> str:
+    """Return what stands over the table."""
+    return f"Playing rung {splits[0].rung} at {splits[0].width}x{splits[0].height}"
+
+
+def describe(splits: Sequence[Split]) -> str:
+    """Return the table as it is printed."""
+    return f"{title(splits)}\n{as_text(table(splits))}"

@@ -157,28 +157,46 @@ def render(
     reel: Annotated[Path, tyro.conf.Positional],
     view: Path,
     size: str | None = None,
+    rung: str | None = None,
     backend: Backend = "auto",
     json: Path | None = None,
 ) -> None:
-    """Print how many frames of a reel are drawn in a second, with and without temporal culling.
+    """Print how many frames of a reel are drawn in a second.
+
+    Of Gaussians with and without temporal culling; of a VideoRF where its time goes, in every quality.
 
     Args:
-        what: All frames of a reel, PLY or .splatv, from one camera, in three ways with the same pictures: `listed`,
-            what is alive is known beforehand, as when a reel is played; `culled`, the kernels find out; `not culled`.
+        what: All frames of a reel, PLY or .splatv, from one camera. Gaussians in three ways with the same pictures:
+            `listed`, what is alive is known beforehand, as when a reel is played; `culled`, the kernels find out; `not
+            culled`. A VideoRF by the steps of its march: `full`, `fast`, `draft`.
         reel: The file.
         view: A CAMERA.json, or a capture: its first camera that is held out.
         size: Pictures as WIDTHxHEIGHT instead of the camera's own.
+        rung: Of a VideoRF, which rate: its QP as 20, or with its codec as hevc:20; the best without it.
         backend: What to render with.
         json: Write the figures to this file too.
     """
     _check(1, json)
     from ..bench import render as bench
+    from ..reel import VIDEORF, reel_kind
 
-    result = bench.measure(reel, view, parse_size(size) if size else None, backend)
+    camera = bench.view_camera(view)
+    camera = camera.scaled(*parse_size(size)) if size else camera
+    figures: dict[str, object]
+    if reel_kind(reel) == VIDEORF:
+        from ..bench.split import describe, measure_splits
+
+        splits = measure_splits(reel, camera, rung, backend)
+        text, figures = describe(splits), {"splits": [split.as_dict() for split in splits]}
+    else:
+        if rung is not None:
+            raise HoloreelError(f"{reel} holds Gaussians, which have no rungs: leave --rung away.")
+        result = bench.measure(reel, camera, None, backend)
+        text, figures = bench.report(result), result.as_dict()
     hardware = _hardware()
-    print(f"{_describe(hardware)}\n{bench.report(result)}")
+    print(f"{_describe(hardware)}\n{text}")
     if json is not None:
-        write_json(json, {"machine": hardware, **result.as_dict()})
+        write_json(json, {"machine": hardware, **figures})
 
 
 def seams(

@@ -54,7 +54,7 @@ def prepare(arguments: list[str]) -> Callable[..., None]:
         """
         names = [variant.key for variant in VARIANTS] if rows == ("all",) else list(rows)
         pixels = parse_size(size)
-        with tqdm(unit="step", dynamic_ncols=True) as bar:
+        with tqdm(dynamic_ncols=True, bar_format="{desc} {n_fmt}/{total_fmt} |{bar}| {elapsed}") as bar:
 
             def show(doing: str, done: int, total: int) -> None:
                 bar.set_description(doing, refresh=False)

@@ -309,9 +309,10 @@ def test_from_a_capture_to_tables_and_a_page(tmp_path, capsys):
     assert len(list((out / "rows/crops").glob("*.png"))) == 4
 
 
-def test_the_split_of_a_played_frame(model, capture, tmp_path):
-    write_reel(model, tmp_path / "a.reel", [RungSpec(30), RungSpec(20, "hevc")])
-    splits = measure_splits(tmp_path / "a.reel", capture.cameras["right"], "hevc:20")
+def test_the_split_of_a_played_frame(model, capture, tmp_path, capsys):
+    reel = tmp_path / "a.reel"
+    write_reel(model, reel, [RungSpec(30), RungSpec(20, "hevc")])
+    splits = measure_splits(reel, capture.cameras["right"], "hevc:20")
     assert [split.rung for split in splits] == ["hevc:20"] * 3
     for split in splits:
         assert min(split.decode, split.unpack, split.render) > 0
@@ -319,3 +320,7 @@ def test_the_split_of_a_played_frame(model, capture, tmp_path):
     assert [line[0] for line in table(splits)] == ["quality", "full", "fast", "draft"]
     quick = replace(splits[0], decode=4.0, unpack=1.0, render=3.0, rest=2.0)
     assert (quick.fps, quick.overlapped_fps) == (100.0, pytest.approx(1000 / 7))
+    view = ["--view", str(capture.source.parent), "--size", "16x12", "--rung", "30", "--json", str(tmp_path / "a.json")]
+    assert main(["bench", "render", str(reel), *view]) == 0
+    assert "Playing rung h264:30 at 16x12" in capsys.readouterr().out
+    assert json.loads((tmp_path / "a.json").read_text())["splits"][2]["quality"] == "draft"
