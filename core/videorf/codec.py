@@ -138,13 +138,16 @@ def encode_video(
         head, spans = fragments(temporary)
         if len(spans) != len(counts):
             raise HoloreelError(f"{path}: the encoder cut {len(spans)} groups, not {len(counts)}; try another codec.")
-        data = temporary.read_bytes()
-    groups = []
-    for first, count, span in zip(firsts, counts, spans, strict=True):
-        part = data[span.offset : span.offset + span.size]
-        luma = next(_decode(data[: head.size] + part, None))
-        groups.append(CodedGroup(first, count, *span, hashlib.sha256(part).hexdigest(), zlib.crc32(luma.tobytes())))
-    return CodedVideo(len(data), head, tuple(groups))
+        groups = []
+        with temporary.open("rb") as file:
+            start = file.read(head.size)
+            for first, count, span in zip(firsts, counts, spans, strict=True):
+                part = file.read(span.size)
+                crc = zlib.crc32(next(_decode(start + part, None)).tobytes())
+                groups.append(CodedGroup(first, count, *span, hashlib.sha256(part).hexdigest(), crc))
+            if file.read(1):
+                raise HoloreelError(f"{path}: the encoder wrote more than its groups; try another codec.")
+    return CodedVideo(spans[-1].offset + spans[-1].size, head, tuple(groups))
 
 
 def _write(

@@ -13,7 +13,7 @@ from holoreel.core.videorf.codec import CODECS, FeatureVideo, encode_video
 from holoreel.core.videorf.mp4 import boxes, fragments
 from holoreel.core.videorf.quantize import Ranges, fit_ranges
 from holoreel.core.videorf.tiles import PROFILES, Tiling, tiling_of
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 COUNTS = (4, 1, 3)
@@ -34,6 +34,7 @@ def video(tmp_path_factory):
     return path, encode_video(path, iter(lumas), COUNTS, fps=23.976, qp=10), lumas
 
 
+@settings(deadline=None)
 @given(st.integers(2, 16), st.integers(0, 2**32 - 1))
 def test_codes_are_within_half_a_step(channels, seed):
     random = np.random.default_rng(seed)
@@ -69,6 +70,7 @@ def test_ranges_are_the_widest_of_all_frames_and_leave_outliers_out():
             Ranges(*bad)
 
 
+@settings(deadline=None)
 @given(st.integers(2, 16), st.integers(1, 3), st.integers(1, 3))
 def test_every_channel_has_its_tile(channels, high, wide):
     tiling = tiling_of("quality", channels, 16 * high, 16 * wide)

@@ -46,6 +46,7 @@ def test_morton_codes_interleave_bits(dimensions):
     assert all((values == edge).all() for values in corner)
 
 
+@settings(deadline=None)
 @given(occupancies(), st.sampled_from(LAYOUTS))
 def test_every_vertex_has_its_own_pixel_and_finds_it_again(occupancy, layout):
     table = build_table(occupancy, SIZES[layout], layout)
@@ -66,6 +67,7 @@ def test_every_vertex_has_its_own_pixel_and_finds_it_again(occupancy, layout):
     assert (place[x, y, z] == image[table.valid()]).all()
 
 
+@settings(deadline=None)
 @given(occupancies(), st.sampled_from(LAYOUTS))
 def test_tables_are_rebuilt_bit_for_bit(occupancy, layout):
     table = build_table(occupancy, SIZES[layout], layout)
@@ -138,7 +140,7 @@ def test_damaged_tables_are_refused():
         table_from_image(twice, 257, table.shape)
 
 
-@settings(max_examples=60)
+@settings(max_examples=60, deadline=None)
 @given(st.lists(st.integers(0, 2**12 - 1), max_size=12), st.integers(1, 14), st.integers(1, 5))
 def test_groups_are_the_longest_prefixes(masks, limit, longest):
     frames = [np.array([mask >> bit & 1 for bit in range(12)], bool).reshape(2, 2, 3) for mask in masks]
