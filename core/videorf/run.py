@@ -5,6 +5,8 @@ Every stage leaves files, whole or not at all, in the checkpoint beside the reel
 missing. What a frame needs is read when its turn comes, so that memory does not grow with the video.
 """
 
+import hashlib
+import json
 import math
 import platform
 import shutil
@@ -135,8 +137,9 @@ def train_video(
     `coarse` is a folder of coarse fields to take, or to fill, instead of the run's own: runs that differ in later
     stages share it. So many `workers` train them at once. Without `keep_model`, the returned model has lost its rows
     once the run is over. When stopped, the run goes on with `resume` behind the last frame that was finished, and ends
-    in the same bits. Raises `HoloreelError` where `out` cannot be written, the checkpoint or the shared folder belongs
-    to other settings, the capture has no masks, or a frame does not fit into the image.
+    in the same bits; as long as it has not come to the network, other settings may be given. Raises `HoloreelError`
+    where `out` cannot be written, the checkpoint or the shared folder belongs to other settings, the capture has no
+    masks, or a frame does not fit into the image.
     """
     config = config or VideoConfig()
     paths = RunPaths(out)
@@ -149,7 +152,8 @@ def train_video(
             f"{capture.source}: a VideoRF is of a subject alone, and not all pictures have masks or transparency; give "
             "masks, render over a transparent film, or train Spacetime Gaussians (stg)."
         )
-    _claim_settings(paths.settings, {"config": asdict(config), "capture": _identity(capture)})
+    settings = {"config": asdict(config), "capture": _identity(capture)}
+    _claim_settings(paths.settings, settings, renew=not paths.partial.exists())
     run = _Run(capture, config, paths, coarse or paths.coarse, workers, on_progress)
     with one_torch_thread():
         model = run.model()
@@ -249,10 +253,10 @@ class _Run:
         config, job = self.config, self.job
         settings = {
             "capture": _identity(self.capture),
-            "lattice": asdict(self.lattice),
-            "coarse_lattice": asdict(job.lattice),
+            "lattice": asdict(job.lattice),
             "config": asdict(config.coarse),
-            **{name: getattr(config, name) for name in ("gamma", "weight_share", "border", "seed")},
+            "border": config.border,
+            "seed": config.seed,
         }
         _claim_settings(job.folder / "settings.json", settings)
         done = [0] * self.frames
@@ -266,8 +270,11 @@ class _Run:
         return [self._occupancy(frame) for frame in range(self.frames)]
 
     def _occupancy(self, frame: int) -> Occupancy:
-        """Return the occupancy of a frame, from its file where there is one."""
-        config, path = self.config, self.job.folder / f"occupancy_{frame:06d}.npy"
+        """Return the occupancy of a frame, from its file where there is one; its name tells what it is made of."""
+        config = self.config
+        made_of = [asdict(self.lattice), config.gamma, config.weight_share]
+        digest = hashlib.sha256(json.dumps(made_of).encode()).hexdigest()[:12]
+        path = self.job.folder / f"occupancy_{digest}_{frame:06d}.npy"
         if not path.exists():
             views = FrameViews(self.capture, frame, border=config.border)
             hull = visual_hull(views, self.lattice, config.coarse.misses, config.coarse.reach)
@@ -432,9 +439,12 @@ def through_codec(table: MappingTable, previous: Rows | None, config: VideoConfi
     return trip
 
 
-def _claim_settings(path: Path, settings: dict[str, Any]) -> None:
-    """Write down what a folder's files are made of, or make sure that it is the same. Raises `HoloreelError`."""
-    if not path.exists():
+def _claim_settings(path: Path, settings: dict[str, Any], renew: bool = False) -> None:
+    """Write down what a folder's files are made of, or make sure that it is the same. Raises `HoloreelError`.
+
+    `renew` writes it down anew: there are no such files yet.
+    """
+    if renew or not path.exists():
         write_json(path, settings)
         return
     changed = differences(read_json(path), settings, tuple(f"config.{name}" for name in FREE_SETTINGS))
