@@ -27,14 +27,15 @@ RUNGS = (16, 20, 24, 28, 32, 36)  # QP
 NEUTRAL = 128
 THREADS = "4"  # x264 decides by it where motion may point: fixed, so that every machine writes the same file
 # All frames of a rung have the same QP (`ipratio`), and nothing is smoothed across blocks that hold unrelated vertices:
-# with a slower preset these take 11 % off the bytes at equal quality.
+# with a slower preset these take 11 to 17 % off the bytes at equal quality.
 _H264 = "keyint=infinite:scenecut=0:open-gop=0:ref=3:bframes=0:weightp=0:ipratio=1.0:no-deblock=1:fullrange=on"
-# x265 is made for the eye: without these, it spends half as much again as x264; with them, 7 % less.
+# x265 is tuned for the eye: without these it spends half as much again as x264, with them 4 to 7 % less.
 _HEVC = (
     "keyint=-1:scenecut=0:open-gop=0:bframes=0:range=full:aq-mode=0:ipratio=1.0:no-deblock=1:no-sao=1:cutree=0"
     ":psy-rd=0:psy-rdoq=0:rd=6:tskip=1:ctu=32:max-tu-size=8:log-level=error"
 )
-_AV1 = "rc=0:keyint=-1:scd=0:pred-struct=1:aq-mode=0:color-range=1:lp=2"
+# Feature images are more like a screen (`scm`) than a photograph. Even so, AV1 spends a third more than x264.
+_AV1 = "rc=0:keyint=-1:scd=0:pred-struct=1:aq-mode=0:color-range=1:scm=1:enable-cdef=0:enable-restoration=0:lp=2"
 FULL_RANGE = 2  # AVCOL_RANGE_JPEG
 
 
@@ -55,7 +56,7 @@ CODECS = {
         51,
     ),
     "hevc": Codec("libx265", {"preset": "slow", "forced-idr": "1", "x265-params": _HEVC + ":qp={qp}"}, "hvc1", 51),
-    "av1": Codec("libsvtav1", {"preset": "6", "svtav1-params": _AV1 + ":qp={qp}"}, "av01", 63),
+    "av1": Codec("libsvtav1", {"preset": "2", "svtav1-params": _AV1 + ":qp={qp}"}, "av01", 63),
 }
 
 
