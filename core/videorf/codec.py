@@ -287,16 +287,10 @@ class FeatureVideo:
         self._group, self._next, self._latest = group, group.first, None
         self._frames = _decode(self._head() + self._fragment(group), self.picture)
 
-    def check(self) -> Iterator[str]:
-        """Yield what is wrong with the file, a sentence each: nothing where every group can be played. Decodes
-        nothing.
-        """
-        for group in self.video.groups:
-            try:
-                self._head()
-                self._fragment(group)
-            except HoloreelError as error:
-                yield str(error)
+    def check(self, group: CodedGroup) -> None:
+        """Raise `HoloreelError` where a group's bytes are not those that were encoded; decodes nothing."""
+        self._head()
+        self._fragment(group)
 
     def _head(self) -> bytes:
         head = self._read(self.video.head)

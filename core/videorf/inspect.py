@@ -83,7 +83,7 @@ def _files(reel: VideoReel) -> list[str]:
 
 
 def _problems(reel: VideoReel) -> Iterator[str]:
-    """Yield what is wrong: read every table and the network, and decode the first frame that each rung has."""
+    """Yield what is wrong: read every file, and decode the first frame that each rung has."""
     yield from _told(reel.shade)
     for group in range(len(reel.groups)):
         yield from _told(partial(reel.table, group))
@@ -96,9 +96,9 @@ def _video_problems(reel: VideoReel, rung: int) -> Iterator[str]:
     lost = video.missing()
     for group in lost:
         yield f"{video.path} is cut off: {_span(reel, group.first, group.frames)} cannot be played; fetch the rest."
-    whole = next((group for group in video.video.groups if group not in lost), None)
-    if whole is not None:
-        yield from _told(partial(video.luma, whole.first))
+    whole = [group for group in video.video.groups if group not in lost]
+    damaged = dict.fromkeys(problem for group in whole for problem in _told(partial(video.check, group)))
+    yield from damaged or (_told(partial(video.luma, whole[0].first)) if whole else ())
     if video.size > video.video.size:
         more = video.size - video.video.size
         yield f"{video.path} has {more:,} bytes more than its reel says: it may be another file; fetch the original."

@@ -21,9 +21,8 @@ of bytes in a file, so a static HTTP server with ranges is all that a stream nee
 
 import hashlib
 from bisect import bisect_right
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
-from functools import partial
 from itertools import accumulate
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -159,24 +158,6 @@ class VideoReel:
                 f"again."
             )
         return table
-
-    def problems(self) -> list[str]:
-        """Return what is wrong with the files beside the reel, a sentence each; nothing where all of it can be played.
-
-        Everything is read and nothing decoded.
-        """
-        found: list[str] = []
-        checks: list[Callable[[], object]] = [self.shade]
-        checks += [partial(self.table, group) for group in range(len(self.groups))]
-        checks += [
-            partial(lambda rung: found.extend(self.video(rung).check()), rung) for rung in range(len(self.rungs))
-        ]
-        for check in checks:
-            try:
-                check()
-            except HoloreelError as error:
-                found.append(str(error))
-        return list(dict.fromkeys(found))
 
     def shade(self) -> Shading:
         """Read the shading network. Raises `HoloreelError` where it is missing or another one than the reel's."""
