@@ -100,6 +100,20 @@ def test_profiles_are_what_decoders_take():
         Tiling(2, 16, 16, 2, 1).unpack(np.zeros((16, 16), np.uint8))
 
 
+@pytest.mark.parametrize(("profile", "level"), [("universal", 40), ("quality", 50)])
+def test_the_largest_pictures_are_of_the_level_that_hardware_decodes(tmp_path, profile, level):
+    import av
+
+    picture = tiling_of(profile, 8, 512, 512).picture
+    lumas = [np.full(picture, value, np.uint8) for value in (90, 91, 92, 93, 94)]
+    encode_video(tmp_path / "a.mp4", lumas, (5,), fps=30, qp=20)
+    with av.open(str(tmp_path / "a.mp4")) as container:
+        context = container.streams.video[0].codec_context
+        version, kind, _, coded = context.extradata[:4]
+        assert (version, kind, coded) == (1, 100, level)  # 100: High
+        assert context.pix_fmt in ("yuv420p", "yuvj420p")
+
+
 @pytest.mark.parametrize("codec", CODECS)
 def test_any_frame_decodes_to_what_all_frames_in_order_do(tmp_path, codec):
     lumas = smooth_lumas()
