@@ -3,7 +3,7 @@
 .PHONY: help setup demo test test-slow lint core-tests blender-tests clean
 .DEFAULT_GOAL := help
 
-KERNELS := $(wildcard core/render/kernels/*) CMakeLists.txt __init__.py
+KERNELS := $(wildcard core/render/kernels/* core/videorf/kernels/*) CMakeLists.txt __init__.py
 PYTEST_MARK ?= not slow
 
 help:

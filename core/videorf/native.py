@@ -11,7 +11,7 @@ from pathlib import Path
 from ..errors import HoloreelError
 from ..render.native import available_cores
 
-ABI = 2  # VIDEORF_ABI in kernels/api.hpp
+ABI = 3  # VIDEORF_ABI in kernels/api.hpp
 
 
 class CLattice(Structure):

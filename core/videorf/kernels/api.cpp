@@ -21,8 +21,8 @@ namespace {
 
 constexpr int64_t kRun = 64;  // rays a task marches
 constexpr size_t kSpareTapes = 2;
-std::mutex call_mutex;        // the pool and the spare tapes serve one call at a time
-int wanted_lanes = 0;                   // 0: the widest this machine has
+std::mutex call_mutex;  // the pool and the spare tapes serve one call at a time
+int wanted_lanes = 0;   // 0: the widest this machine has
 
 thread_local char error_text[256] = "";
 
@@ -219,7 +219,8 @@ VIDEORF_API int videorf_draw(const Volume* volume, const float* table, int32_t c
         check(*network, channels);
         check(*view);
         check(VideorfRays{0, nullptr, nullptr, nullptr, view->step, view->transmittance_min});
-        draw(*volume, table, channels, *network, *view, kernels(channels), use_wide() ? wide_shade() : narrow_shade(), *picture);
+        const Shade shade = use_wide() ? wide_shade() : narrow_shade();
+        draw(*volume, table, channels, *network, *view, kernels(channels), shade, *picture);
     });
 }
 
@@ -234,7 +235,8 @@ VIDEORF_API int videorf_optimize(const VideorfStep* step) {
 }
 
 // out = rows + uniform noise of -step / 2 ... step / 2, which hangs on `key` and the place in the table alone.
-VIDEORF_API int videorf_add_noise(const float* rows, int64_t count, int32_t channels, const float* step, uint32_t key, float* out) {
+VIDEORF_API int videorf_add_noise(const float* rows, int64_t count, int32_t channels, const float* step, uint32_t key,
+                                  float* out) {
     return guarded([&] {
         const TableKernels& kernel = table_kernels(channels);
         each_run(count, [&](int64_t first, int64_t last) { kernel.noise(rows, step, channels, key, first, last, out); });

@@ -39,7 +39,8 @@ void take_rays(const VideorfView& view, int64_t tile, Tile& out) {
         }
 }
 
-void write_pixel(const VideorfView& view, const Tile& tile, int i, int channels, const float* color, const VideorfPicture& picture) {
+void write_pixel(const VideorfView& view, const Tile& tile, int i, int channels, const float* color,
+                 const VideorfPicture& picture) {
     const int64_t pixel = tile.pixels[i];
     const float left = tile.accumulated[i * channels], alpha = 1 - left;
     picture.alpha[pixel] = alpha;

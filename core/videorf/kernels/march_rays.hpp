@@ -34,15 +34,15 @@ HOLOREEL_INLINE int count_true(Mask8 mask) {
 #endif
 }
 
-// Samples in occupied cells that wait for being taken, in order. A batch may be added as long as less than two wait.
+// Samples in occupied cells that wait for being taken, in order. A batch may be added as long as less than one waits.
 struct Queue {
     int count = 0;
-    alignas(32) int32_t corner[3 * kBatch];  // of the cell, its lowest, in Volume::rows_of
-    alignas(32) float x[3 * kBatch], y[3 * kBatch], z[3 * kBatch];
-    alignas(32) float t[3 * kBatch];  // from the entry into the lattice, in spacings
+    alignas(32) int32_t corner[2 * kBatch];  // of the cell, its lowest, in Volume::rows_of
+    alignas(32) float x[2 * kBatch], y[2 * kBatch], z[2 * kBatch];
+    alignas(32) float t[2 * kBatch];  // from the entry into the lattice, in spacings
 
     HOLOREEL_INLINE_MEMBER void drop_batch() {
-        const auto move = [](auto* values) { std::memmove(values, values + kBatch, 2 * kBatch * sizeof *values); };
+        const auto move = [](auto* values) { std::memcpy(values, values + kBatch, kBatch * sizeof *values); };
         move(corner), move(x), move(y), move(z), move(t);
         count -= kBatch;
     }
@@ -99,13 +99,9 @@ public:
     }
 
     // Adds the next samples until there is a whole batch or the ray ends.
-    template <class Fetch> HOLOREEL_INLINE_MEMBER void fill(Queue& queue, Fetch fetch) {
-        while (queue.count < 2 * kBatch && next_ < samples_) {
-            const int before = queue.count;
-            if (leap()) continue;
-            collect(queue);
-            for (int i = before; i < queue.count; i++) fetch(queue.corner[i]);
-        }
+    HOLOREEL_INLINE_MEMBER void fill(Queue& queue) {
+        while (queue.count < kBatch && next_ < samples_)
+            if (!leap()) collect(queue);
     }
 
     double entry;  // where the ray enters, in spacings from its origin
@@ -116,8 +112,8 @@ private:
         return std::min(static_cast<int>(p), volume_.cells[axis] - 1) / kBrick;
     }
 
-    // Moves on to the first sample beyond the empty bricks around, if it is among such. A sample that is so near to their border
-    // that rounding decides is looked at again.
+    // Moves on to the first sample beyond the empty bricks around, if it is among such. A sample so near to their border that
+    // rounding decides is looked at again.
     HOLOREEL_INLINE_MEMBER bool leap() {
         const float t = (static_cast<float>(next_) + jitter_) * step_;
         const int at[3] = {brick_at(0, t), brick_at(1, t), brick_at(2, t)};
@@ -243,12 +239,6 @@ HOLOREEL_INLINE int64_t march_run(const March& march, int64_t first, int64_t las
     Batch batch;
     Queue queue;
     Row rows[kBatch];
-    const int32_t* corners = march.volume->rows_of.data();
-    const auto fetch = [&](int32_t corner) {
-        for (int along : {0, kStrideX})
-            for (int offset : {0, kStrideY})
-                __builtin_prefetch(march.table + size_t(corners[corner + along + offset]) * C);
-    };
     for (int64_t ray = first; ray < last; ray++) {
         Walk walk(*march.volume, march.rays, ray);
         const float entry = static_cast<float>(walk.entry);
@@ -257,7 +247,7 @@ HOLOREEL_INLINE int64_t march_run(const March& march, int64_t first, int64_t las
         float left = 1;
         queue.count = 0;
         for (;;) {
-            walk.fill(queue, fetch);
+            walk.fill(queue);
             if (queue.count == 0) break;
             if (queue.count < kBatch) queue.pad();
             sample<C, kTape>(march, queue, rows, batch);
@@ -335,8 +325,9 @@ void backward_rays(const VideorfImageGradients& gradients, double spacing, int64
             const float density = chunk.slope[k] * (chunk.after[k] * seen - behind);
             behind += chunk.weight[k] * seen;
             const int32_t brick = chunk.corner[k] / kBrickVertices;
-            sorted[next[brick]++] = {static_cast<int32_t>(ray), chunk.corner[k] - brick * kBrickVertices, chunk.x[k], chunk.y[k],
-                                     chunk.z[k], chunk.weight[k], density, 0.0f};
+            const int32_t inside = chunk.corner[k] - brick * kBrickVertices;
+            sorted[next[brick]++] = {static_cast<int32_t>(ray), inside,          chunk.x[k], chunk.y[k],
+                                     chunk.z[k],                chunk.weight[k], density,    0.0f};
         }
     }
 }

@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-// A row of a table in the compiler's vectors of 4, 8 or 16 floats. Included by each width's translation unit, in a namespace of its
-// own.
+// A row of a table in the compiler's vectors of 4, 8 or 16 floats. Included by each width's translation unit, in a namespace of
+// its own.
 #pragma once
 
 #include <cstring>

@@ -14,8 +14,8 @@ using namespace videorf;
 using Group = RowOf<kGroup>::type;
 typedef double Group64 __attribute__((vector_size(kGroup * sizeof(double))));
 
-// out = matrix in + bias, the matrix row by row, then the bias; returns what lies behind them. Four rows at a time: one would wait
-// for its own sums.
+// out = matrix in + bias, the matrix row by row, then the bias; returns what lies behind them. Four rows at a time: one would
+// wait for its own sums.
 HOLOREEL_INLINE const float* layer(const float* weights, int outputs, int inputs, const Group* in, Group* out) {
     const float* bias = weights + outputs * inputs;
     int o = 0;
@@ -41,8 +41,8 @@ HOLOREEL_INLINE void rectify(Group* values, int count) {
     for (int o = 0; o < count; o++) values[o] = values[o] > 0 ? values[o] : Group{};
 }
 
-// PE(d) = [d, sin d, cos d, sin 2d, cos 2d, ...] of directions whose parts lie in -1 ... 1. Taylor's series there are good to 1e-12,
-// and doubled angles lose little of that in float64.
+// PE(d) = [d, sin d, cos d, sin 2d, cos 2d, ...] of directions whose parts lie in -1 ... 1. Taylor's series there are good to
+// 1e-12, and doubled angles lose little of that in float64.
 HOLOREEL_INLINE void encode(const float* directions, int frequencies, Group* out) {
     for (int a = 0; a < 3; a++) {
         Group64 x;
@@ -69,7 +69,8 @@ HOLOREEL_INLINE void encode(const float* directions, int frequencies, Group* out
 }
 
 // Colors (kGroup, 3) of kGroup rays with their sums (kGroup, channels) and directions.
-void shade_group(const VideorfNetwork& network, const float* accumulated, int channels, const float* directions, float* colors) {
+void shade_group(const VideorfNetwork& network, const float* accumulated, int channels, const float* directions,
+                 float* colors) {
     Group first[kMaxUnits], second[kMaxUnits];
     for (int c = 0; c < network.features; c++)
         for (int i = 0; i < kGroup; i++) first[c][i] = accumulated[i * channels + 1 + c];

@@ -81,7 +81,8 @@ template <int C, bool kWhole> void move_rows(const VideorfStep& s, int64_t first
 
 // The numbers are Wellons' "lowbias32" of their place in the table: they hang on nothing else.
 template <int C, bool kWhole>
-void noise_rows(const float* values, const float* step, int32_t channels, uint32_t key, int64_t first, int64_t last, float* out) {
+void noise_rows(const float* values, const float* step, int32_t channels, uint32_t key, int64_t first, int64_t last,
+                float* out) {
     if (kWhole) channels = C;
     for (int64_t row = first; row < last; row++) {
         const uint32_t at = static_cast<uint32_t>(row * channels);

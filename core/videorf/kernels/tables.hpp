@@ -8,11 +8,13 @@ namespace holoreel {
 namespace videorf {
 
 struct TableKernels {
-    // Brings the moments of rows first ... last - 1 up to date. It reads the rows' neighbors: no row may move before all are done.
+    // Brings the moments of rows first ... last - 1 up to date. It reads the rows' neighbors: no row may move before all are
+    // done.
     void (*moments)(const VideorfStep&, int64_t first, int64_t last);
     // Moves rows first ... last - 1.
     void (*move)(const VideorfStep&, int64_t first, int64_t last);
-    void (*noise)(const float* rows, const float* step, int32_t channels, uint32_t key, int64_t first, int64_t last, float* out);
+    void (*noise)(const float* rows, const float* step, int32_t channels, uint32_t key, int64_t first, int64_t last,
+                  float* out);
 };
 
 const TableKernels* wide_tables(int channels);  // null where the processor family has no wider vectors

@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-// A lattice as the march walks it. Cells (between eight vertices) lie in bricks of 4³. An empty brick knows how far it is to the
-// next one that is not, so that rays leap over all that lies between. A brick keeps the table's rows of its 5³ vertices side by
-// side, so that the samples of a ray find their corners in few lines of memory.
+// A lattice as the march walks it. Cells (between eight vertices) lie in bricks of 4³. An empty brick knows how far it is to
+// the next one that is not, so that rays leap over all that lies between. A brick keeps the table's rows of its 5³ vertices side
+// by side, so that the samples of a ray find their corners in few lines of memory.
 #pragma once
 
 #include <cstdint>
