@@ -29,6 +29,7 @@ from .views import FrameViews
 
 UNKNOWN_COLOR = 0.5  # of vertices that were not trained
 START_DENSITY = 0.0  # the hull is half-solid at first
+WIDEST = 48  # vertices along the longest side of the lattice that training begins with
 REPORT_EVERY = 20  # steps
 HIGHEST = 16.0  # raw densities lie between EMPTY_DENSITY and this
 SMOOTH_STEPS = (1.0, 0.1, 0.1, 0.1)  # differences of density and color that total variation takes for large
@@ -158,8 +159,8 @@ def _array(archive: zipfile.ZipFile, name: str) -> NDArray:
 class CoarseConfig:
     """How a coarse field is trained."""
 
-    iterations: int = 300
-    """steps"""
+    iterations: int = 400
+    """steps, in equal parts on the lattice and on each of the wider ones it starts from"""
     rays: int = 4096
     """pixels that a step looks at"""
     density_rate: float = 0.7
@@ -194,26 +195,34 @@ def train_coarse(
 ) -> Coarse:
     """Return the density and color of one frame, optimized in the vertices of its visual hull.
 
-    The loss is that of the rays' colors over a random background each, so that what is empty must let it through, plus
-    the entropy of what a ray lets through (DVGO). `on_progress` hears of the steps done and the batch's PSNR. The
-    result hangs on the seed, not on the number of threads. Raises `HoloreelError` where the hull is empty.
+    A large lattice starts from what one of twice the spacing has learned, which starts from a wider one in turn: far
+    fewer steps then lead as far. The loss is that of the rays' colors over a random background each, so that what is
+    empty must let it through, plus the entropy of what a ray lets through (DVGO) and the total variation in space.
+
+    `on_progress` hears of the steps done and the batch's PSNR. The result hangs on the seed, not on the number of
+    threads. Raises `HoloreelError` where the hull is empty.
     """
     config = config or CoarseConfig()
-    hull = visual_hull(views, lattice, config.misses, config.reach)
-    vertices = np.argwhere(hull)
-    vertices = vertices[np.argsort(morton.encode(*vertices.T))]
-    lookup = np.full(lattice.shape, -1, np.int32)
-    lookup[tuple(vertices.T)] = np.arange(len(vertices))
-    volume = Volume(FieldLattice(lattice, lookup, len(vertices) + 1))
+    lattices = [lattice]
+    while max(lattices[0].shape) > WIDEST:
+        lattices.insert(0, wider(lattices[0]))
+    generator = torch.Generator().manual_seed(seed)
+    coarse: Coarse | None = None
+    ends = [config.iterations * (level + 1) // len(lattices) for level in range(len(lattices))]
     with one_torch_thread():
-        rows = _optimized(volume, views, config, seed, on_progress)
-        weights = ray_weights(volume, rows, views, config, seed)
-    return Coarse(
-        lattice,
-        _scattered(rows[:-1, 0], vertices, lattice, EMPTY_DENSITY),
-        _scattered(rows[:-1, 1:], vertices, lattice, UNKNOWN_COLOR),
-        _scattered(weights, vertices, lattice, 0.0),
-    )
+        for level, done, end in zip(lattices, (0, *ends), ends, strict=False):
+            hull = visual_hull(views, level, config.misses, config.reach)
+            training = _Training(views, level, hull, config, generator, coarse)
+            training.run(done, end, on_progress)
+            coarse = training.coarse()
+    assert coarse is not None
+    return coarse
+
+
+def wider(lattice: Lattice) -> Lattice:
+    """Return a lattice of twice the spacing that covers the same box."""
+    x, y, z = (max(2, edge // 2 + 1) for edge in lattice.shape)
+    return Lattice((x, y, z), lattice.lowest, 2 * lattice.spacing)
 
 
 @contextmanager
@@ -227,39 +236,76 @@ def one_torch_thread() -> Iterator[None]:
         torch.set_num_threads(threads)
 
 
-def _optimized(
-    volume: Volume, views: FrameViews, config: CoarseConfig, seed: int, on_progress: Listener | None
-) -> Tensor:
-    """Return the rows (N + 1, 4) [raw density, color]: color is what the march sums, without any activation."""
-    rows = torch.tensor([START_DENSITY, *[UNKNOWN_COLOR] * 3]).repeat(volume.field.rows, 1)
-    rows[-1] = torch.tensor([EMPTY_DENSITY, 0.0, 0.0, 0.0])
-    low, high = torch.tensor([EMPTY_DENSITY, 0.0, 0.0, 0.0]), torch.tensor([HIGHEST, 1.0, 1.0, 1.0])
-    neighbors = lattice_neighbors(volume.field.lookup)
-    optimizer = TableOptimizer(neighbors, rows, torch.tensor(SMOOTH_STEPS), low, high)
-    rates = torch.tensor([config.density_rate, *[config.color_rate] * 3])
-    generator = torch.Generator().manual_seed(seed)
-    for iteration in range(config.iterations):
-        leaf = rows.detach().requires_grad_()
-        photometric, unsure = _losses(volume, leaf, views, config, generator)
-        (gradient,) = torch.autograd.grad(photometric + config.entropy * unsure, leaf)
-        optimizer.step(gradient, rates * config.final_rate ** (iteration / config.iterations), spatial=config.smooth)
-        if on_progress and ((iteration + 1) % REPORT_EVERY == 0 or iteration + 1 == config.iterations):
-            on_progress(iteration + 1, -10 * math.log10(max(photometric.item() / 3, 1e-10)))
-    return rows
+class _Training:
+    """The training of one lattice's rows (N + 1, 4) [raw density, color]: the march sums color as it is."""
 
+    def __init__(
+        self,
+        views: FrameViews,
+        lattice: Lattice,
+        hull: Occupancy,
+        config: CoarseConfig,
+        generator: torch.Generator,
+        start: Coarse | None,
+    ) -> None:
+        self.views, self.lattice, self.config, self.generator = views, lattice, config, generator
+        vertices = np.argwhere(hull)
+        self.vertices = vertices[np.argsort(morton.encode(*vertices.T))]
+        lookup = np.full(lattice.shape, -1, np.int32)
+        lookup[tuple(self.vertices.T)] = np.arange(len(vertices))
+        self.volume = Volume(FieldLattice(lattice, lookup, len(vertices) + 1))
+        self.rows = self._first_rows(start)
+        low, high = torch.tensor([EMPTY_DENSITY, 0.0, 0.0, 0.0]), torch.tensor([HIGHEST, 1.0, 1.0, 1.0])
+        self.optimizer = TableOptimizer(lattice_neighbors(lookup), self.rows, torch.tensor(SMOOTH_STEPS), low, high)
 
-def _losses(
-    volume: Volume, rows: Tensor, views: FrameViews, config: CoarseConfig, generator: torch.Generator
-) -> tuple[Tensor, Tensor]:
-    """Return L_rgb of a batch and the mean entropy of its background."""
-    batch = views.sample(config.rays, generator)
-    jitter = torch.rand(config.rays, generator=generator)
-    background = torch.rand(config.rays, 3, generator=generator)
-    marched = march(volume, rows, Rays(batch.origins, batch.directions, jitter), MarchRules(config.step))
-    alpha = batch.rgba[:, 3:]
-    truth = batch.rgba[:, :3] * alpha + background * (1 - alpha)
-    left = marched.transmittance
-    return rgb_loss(marched.features + left[:, None] * background, truth), entropy(left).mean()
+    def _first_rows(self, start: Coarse | None) -> Tensor:
+        rows = torch.tensor([START_DENSITY, *[UNKNOWN_COLOR] * 3]).repeat(len(self.vertices) + 1, 1)
+        rows[-1] = torch.tensor([EMPTY_DENSITY, 0.0, 0.0, 0.0])
+        if start is not None:
+            there, place = start.resampled(self.lattice), tuple(self.vertices.T)
+            rows[:-1, 0] = torch.from_numpy(there.density[place]).clamp(EMPTY_DENSITY, HIGHEST)
+            rows[:-1, 1:] = torch.from_numpy(there.color[place])
+        return rows
+
+    def run(self, done: int, end: int, on_progress: Listener | None) -> None:
+        """Go the steps `done` to `end` of all."""
+        config = self.config
+        rates = torch.tensor([config.density_rate, *[config.color_rate] * 3])
+        for iteration in range(done, end):
+            leaf = self.rows.detach().requires_grad_()
+            photometric, unsure = self._losses(leaf)
+            (gradient,) = torch.autograd.grad(photometric + config.entropy * unsure, leaf)
+            decay = config.final_rate ** ((iteration - done) / (end - done))
+            self.optimizer.step(gradient, rates * decay, spatial=config.smooth)
+            if on_progress and ((iteration + 1) % REPORT_EVERY == 0 or iteration + 1 == config.iterations):
+                on_progress(iteration + 1, -10 * math.log10(max(photometric.item() / 3, 1e-10)))
+
+    def _losses(self, rows: Tensor) -> tuple[Tensor, Tensor]:
+        """Return L_rgb of a batch and the mean entropy of its background."""
+        count = self.config.rays
+        batch = self.views.sample(count, self.generator)
+        rays = Rays(batch.origins, batch.directions, torch.rand(count, generator=self.generator))
+        background = torch.rand(count, 3, generator=self.generator)
+        marched = march(self.volume, rows, rays, MarchRules(self.config.step))
+        alpha = batch.rgba[:, 3:]
+        truth = batch.rgba[:, :3] * alpha + background * (1 - alpha)
+        left = marched.transmittance
+        return rgb_loss(marched.features + left[:, None] * background, truth), entropy(left).mean()
+
+    def coarse(self) -> Coarse:
+        """Return what has been learned."""
+        weights = ray_weights(self.volume, self.rows, self.views, self.config, self.generator)
+        return Coarse(
+            self.lattice,
+            self._grid(self.rows[:-1, 0], EMPTY_DENSITY),
+            self._grid(self.rows[:-1, 1:], UNKNOWN_COLOR),
+            self._grid(weights, 0.0),
+        )
+
+    def _grid(self, values: Tensor, fill: float) -> Grid:
+        grid = np.full((*self.lattice.shape, *values.shape[1:]), fill, np.float32)
+        grid[tuple(self.vertices.T)] = values.numpy()
+        return grid
 
 
 def entropy(transmittance: Tensor) -> Tensor:
@@ -268,23 +314,18 @@ def entropy(transmittance: Tensor) -> Tensor:
     return -(left * left.log() + (1 - left) * (1 - left).log())
 
 
-def ray_weights(volume: Volume, rows: Tensor, views: FrameViews, config: CoarseConfig, seed: int) -> Tensor:
+def ray_weights(
+    volume: Volume, rows: Tensor, views: FrameViews, config: CoarseConfig, generator: torch.Generator
+) -> Tensor:
     """Return what rays of the pool see of each row (N): the sum of their samples' weights, shared out to corners.
 
     That is the gradient of the sum of a summed feature. A large pool is thinned at random.
     """
-    generator = torch.Generator().manual_seed(seed)
     chosen = torch.arange(len(views))
     if len(views) > config.weight_rays:
-        chosen = torch.randperm(len(views), generator=generator)[: config.weight_rays]
+        chosen = torch.randint(len(views), (config.weight_rays,), generator=generator)
     batch = views.rays(chosen)
     leaf = torch.cat((rows[:, :1], torch.zeros_like(rows[:, :1])), 1).requires_grad_()
     marched = march(volume, leaf, Rays(batch.origins, batch.directions), MarchRules(config.step))
     (gradient,) = torch.autograd.grad(marched.features.sum(), leaf)
     return gradient[:-1, 1]
-
-
-def _scattered(values: Tensor, vertices: NDArray[np.int64], lattice: Lattice, fill: float) -> Grid:
-    grid = np.full((*lattice.shape, *values.shape[1:]), fill, np.float32)
-    grid[tuple(vertices.T)] = values.numpy()
-    return grid

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 from holoreel.core.errors import HoloreelError
+from holoreel.core.videorf import coarse as coarse_module
 from holoreel.core.videorf import native, reference
 from holoreel.core.videorf.coarse import (
     Coarse,
@@ -20,6 +21,7 @@ from holoreel.core.videorf.coarse import (
     resample,
     rescaled,
     train_coarse,
+    wider,
 )
 from holoreel.core.videorf.coarse_frames import CoarseJob, train_coarse_frames
 from holoreel.core.videorf.field import FieldLattice, MarchRules, Rays
@@ -227,14 +229,14 @@ def test_weights_are_those_of_the_samples(ball, tmp_path):
     field = FieldLattice(lattice, lookup, 28)
     rows = torch.from_numpy(np.random.default_rng(0).uniform(-1, 1, (28, 4)).astype(np.float32))
     rows[-1, 0] = -8
-    weights = ray_weights(Volume(field), rows, views, CoarseConfig(weight_rays=10**6), 0)
+    weights = ray_weights(Volume(field), rows, views, CoarseConfig(weight_rays=10**6), torch.Generator())
     batch = views.rays(slice(None))
     rays = Rays(batch.origins.double(), batch.directions.double())
     lit = torch.cat((rows[:, :1], torch.eye(28)), 1).double()
     parts = [torch.cat((lit[:, :1], lit[:, 1 + at : 15 + at]), 1) for at in (0, 14)]
     summed = torch.cat([reference.march(field, part, rays).features.sum(0) for part in parts])
     assert weights.numpy() == pytest.approx(summed[:27].numpy(), rel=1e-3)
-    few = ray_weights(Volume(field), rows, views, CoarseConfig(weight_rays=len(views) // 2), 0)
+    few = ray_weights(Volume(field), rows, views, CoarseConfig(weight_rays=len(views) // 2), torch.Generator())
     assert float(few.sum() / weights.sum()) == pytest.approx(0.5, rel=0.2)
 
 
@@ -288,3 +290,31 @@ def test_many_frames_in_many_processes(tmp_path):
     for frame in (0, 2):
         assert (jobs[0].read(frame).density == jobs[1].read(frame).density).all()
     assert (jobs[0].read(0).density != jobs[0].read(2).density).any()
+
+
+@given(st.tuples(*[st.integers(2, 256)] * 3))
+def test_wider_lattices_cover_the_same_box(shape):
+    lattice = Lattice(shape, (0.5, -1.0, 2.0), 0.25)
+    wide = wider(lattice)
+    assert wide.spacing == 0.5
+    assert wide.lowest == lattice.lowest
+    assert all(high >= mine for high, mine in zip(wide.highest, lattice.highest, strict=True))
+    assert all(2 * edge <= mine + 3 for edge, mine in zip(wide.shape, shape, strict=True))
+
+
+def test_large_lattices_start_from_wider_ones(ball):
+    """As many steps on the large lattice alone leave haze."""
+    capture, views, _, _ = ball
+    large, camera = around(60, margin=4), capture.cameras["cam05"]
+    hit, normals = hits_of(camera)
+    truth = np.where(hit[..., None], 0.5 + 0.4 * normals, 1.0)
+    errors, heard = [], []
+    config = CoarseConfig(iterations=60, rays=512)
+    for widest in (256, 32):
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(coarse_module, "WIDEST", widest)
+            field = train_coarse(views, large, config, 0, lambda iteration, _: heard.append(iteration))
+        assert field.lattice == large
+        errors.append(np.square(drawn(field, camera)[0] - truth).mean())
+    assert errors[1] < 0.7 * errors[0]
+    assert heard == [20, 40, 60] * 2
