@@ -18,6 +18,7 @@ from ..draw import Drawing
 from ..errors import HoloreelError
 from ..files import read_json, write_json
 from ..images import picture_path, write_png
+from ..videorf.codec import CODECS
 from ..videorf.config import VideoConfig
 from ..videorf.model import FieldVideo, read_field_video
 from ..videorf.run import RunPaths, VideoProgress, train_video
@@ -88,7 +89,8 @@ class VideoBench:
         """Return a row: measured, or read where it is finished already."""
         folder = self.out / "rows" / variant.key
         path = folder / "row.json"
-        made_of = self._made_of(variant.config(self.base)) | {"coding": plain(asdict(variant.how))}
+        coder = CODECS[variant.how.codec].options
+        made_of = self._made_of(variant.config(self.base)) | {"coding": plain(asdict(variant.how)), "coder": coder}
         record = _record(path, made_of)
         if "rungs" not in record:
             record |= self._measured(variant, self.training(variant), folder)

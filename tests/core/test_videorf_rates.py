@@ -19,6 +19,7 @@ from holoreel.core.capture import Capture, write_capture
 from holoreel.core.cli import main
 from holoreel.core.errors import HoloreelError
 from holoreel.core.images import write_png
+from holoreel.core.videorf.codec import CODECS
 from holoreel.core.videorf.config import VideoConfig
 from holoreel.core.videorf.encode import RungSpec, reel_size, write_reel
 from holoreel.core.videorf.player import FieldPlayer
@@ -179,6 +180,11 @@ def test_rows_share_trainings_and_are_kept(trainer, capture, tmp_path, monkeypat
 
     monkeypatch.setattr(videorf, "coded_rungs", None)
     assert run_videorf(folder, tmp_path, CONFIG, names, print) == rows
+    with monkeypatch.context() as patch:  # another way of encoding is another row
+        slower = CODECS["h264"]._replace(options=CODECS["h264"].options | {"preset": "veryslow"})
+        patch.setitem(CODECS, "h264", slower)
+        with pytest.raises(TypeError):
+            run_videorf(folder, tmp_path, CONFIG, names, print)
     monkeypatch.setattr(videorf, "coded_rungs", coding_module.coded_rungs)
     run_videorf(folder, tmp_path, replace(CONFIG, rays=100), ("percentile",), lambda *now: None)
     run_videorf(folder, tmp_path, replace(CONFIG, rays=100, gamma=0.1), ("percentile",), lambda *now: None)
