@@ -80,6 +80,7 @@ def plot_frames(path: Path, frames: Sequence[int], psnr: Sequence[float], ssim: 
 def plot_curves(path: Path, curves: dict[str, list[list[Any]]], labels: Sequence[str], xlabel: str) -> None:
     """Plot curves by title, each a list of points (x, y) per label, over a logarithmic x. The first one stands out."""
     from matplotlib import colormaps
+    from matplotlib.ticker import LogLocator, NullFormatter
 
     figure, plots = _figure(len(labels), height=4.2)
     palette = colormaps["tab20"].colors  # type: ignore[attr-defined]
@@ -89,8 +90,9 @@ def plot_curves(path: Path, curves: dict[str, list[list[Any]]], labels: Sequence
             color, width = (INK, 2.2) if number == 0 else (palette[(number - 1) % len(palette)], 0.9)
             axes.plot(x, y, color=color, linewidth=width, marker=".", label=title if index == 0 else None)
         axes.set(xlabel=xlabel, ylabel=label, xscale="log")
+        axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
         axes.xaxis.set_major_formatter("{x:g}")
-        axes.xaxis.set_minor_formatter("{x:g}")
+        axes.xaxis.set_minor_formatter(NullFormatter())
     figure.legend(loc="outside lower center", ncols=4, frameon=False, fontsize=8)
     _save(figure, path)
 
