@@ -27,8 +27,8 @@ RUNGS = (16, 20, 24, 28, 32, 36)  # QP
 NEUTRAL = 128
 THREADS = "4"  # x264 decides by it where motion may point: fixed, so that every machine writes the same file
 # All frames of a rung have the same QP (`ipratio`), and nothing is smoothed across blocks that hold unrelated vertices:
-# with a slower preset these take 11 to 17 % off the bytes at equal quality. Vertices keep their pixels, so nothing moves
-# and the shortest search (`me`) will do.
+# with a slower preset these take 11 to 17 % off the bytes at equal quality. Vertices keep their pixels, so nothing
+# moves, and the shortest search (`me`) will do.
 _H264 = "keyint=infinite:scenecut=0:open-gop=0:ref=3:bframes=0:weightp=0:ipratio=1.0:no-deblock=1:me=dia:fullrange=on"
 # x265 is tuned for the eye: without these it spends half as much again as x264, with them 4 to 7 % less.
 _HEVC = (
