@@ -24,6 +24,16 @@ typedef int32_t Mask8 __attribute__((vector_size(32)));
 static_assert(sizeof(Lane8) == kBatch * sizeof(float), "a batch fills one vector");
 
 HOLOREEL_INLINE Lane8 broadcast(float value) { return value - Lane8{}; }
+// The values moved up by kBy lanes, with `fill` in those that get free.
+template <int kBy> HOLOREEL_INLINE Lane8 moved_up(Lane8 values, float fill) {
+    constexpr auto from = [](int lane) { return lane < kBy ? kBatch : lane - kBy; };
+#if defined(__clang__)
+    return __builtin_shufflevector(values, broadcast(fill), from(0), from(1), from(2), from(3), from(4), from(5), from(6), from(7));
+#else
+    return __builtin_shuffle(values, broadcast(fill),
+                             Mask8{from(0), from(1), from(2), from(3), from(4), from(5), from(6), from(7)});
+#endif
+}
 HOLOREEL_INLINE int count_true(Mask8 mask) {
 #if HOLOREEL_LANES == 8
     return __builtin_popcount(_mm256_movemask_ps(reinterpret_cast<__m256>(mask)));
@@ -234,7 +244,6 @@ HOLOREEL_INLINE int64_t march_run(const March& march, int64_t first, int64_t las
     using Row = typename RowOf<C>::type;
     const float least = static_cast<float>(march.rays.transmittance_min);
     const Mask8 lanes = {0, 1, 2, 3, 4, 5, 6, 7};
-    const Lane8 ones = broadcast(1.0f);
     int64_t samples = 0;
     Batch batch;
     Queue queue;
@@ -253,11 +262,11 @@ HOLOREEL_INLINE int64_t march_run(const March& march, int64_t first, int64_t las
             sample<C, kTape>(march, queue, rows, batch);
             // Products over the samples before each, in three steps.
             Lane8 after = load_row<8>(batch.passed);
-            after *= __builtin_shuffle(after, ones, Mask8{8, 0, 1, 2, 3, 4, 5, 6});
-            after *= __builtin_shuffle(after, ones, Mask8{8, 8, 0, 1, 2, 3, 4, 5});
-            after *= __builtin_shuffle(after, ones, Mask8{8, 8, 8, 8, 0, 1, 2, 3});
+            after *= moved_up<1>(after, 1.0f);
+            after *= moved_up<2>(after, 1.0f);
+            after *= moved_up<4>(after, 1.0f);
             after *= left;
-            const Lane8 before = __builtin_shuffle(after, broadcast(left), Mask8{8, 0, 1, 2, 3, 4, 5, 6});
+            const Lane8 before = moved_up<1>(after, left);
             const Mask8 reached = (before > least) & (lanes < queue.count);
             const Lane8 weight = reinterpret_cast<Lane8>(reached & reinterpret_cast<Mask8>(before * load_row<8>(batch.alpha)));
             const int taken = count_true(reached);
