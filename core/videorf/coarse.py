@@ -182,6 +182,16 @@ class CoarseConfig:
     weight_rays: int = 65536
     """rays, at most, by which vertices are weighed"""
 
+    def __post_init__(self) -> None:
+        bounds = {"iterations": 1, "rays": 1, "weight_rays": 1, "entropy": 0, "smooth": 0, "misses": 0, "reach": 0}
+        wrong = [name for name, least in bounds.items() if not getattr(self, name) >= least]
+        positive = ("density_rate", "color_rate", "final_rate", "step")
+        wrong += [name for name in positive if not 0 < getattr(self, name) < math.inf]
+        if wrong:
+            name = wrong[0]
+            least = f"{bounds[name]} or more" if name in bounds else "more than 0"
+            raise HoloreelError(f"--coarse.{name.replace('_', '-')} is {getattr(self, name)}: take {least}.")
+
 
 Listener = Callable[[int, float], None]
 

@@ -292,6 +292,14 @@ def test_many_frames_in_many_processes(tmp_path):
     assert (jobs[0].read(0).density != jobs[0].read(2).density).any()
 
 
+@pytest.mark.parametrize(
+    "wrong", [{"iterations": 0}, {"misses": -1}, {"smooth": float("nan")}, {"step": 0.0}, {"color_rate": float("inf")}]
+)
+def test_settings_out_of_range(wrong):
+    with pytest.raises(HoloreelError, match=f"--coarse.{next(iter(wrong)).replace('_', '-')} is"):
+        CoarseConfig(**wrong)
+
+
 @given(st.tuples(*[st.integers(2, 256)] * 3))
 def test_wider_lattices_cover_the_same_box(shape):
     lattice = Lattice(shape, (0.5, -1.0, 2.0), 0.25)
