@@ -71,7 +71,7 @@ class VideoConfig:
     """Adam's step for the network"""
     final_rate: float = 0.05
     """all rates decay to this part of themselves over a frame"""
-    spatial: float = 1.6e-5
+    spatial: float = 8e-6
     """weight of the total variation of the feature image, in steps of the quantizer (Eq. 5)"""
     temporal: float = 1e-5
     """weight of the difference from the frame before, in steps of the quantizer (Eq. 6)"""
@@ -96,7 +96,7 @@ class VideoConfig:
     codec_every: int = 32
     """steps between two passes through it"""
     qps: tuple[int, ...] = (20, 24, 28, 32, 36)
-    """constant QPs of the rungs that are written"""
+    """constant QPs of the rungs that are written, on the codec's own scale; a player begins with the first"""
     codecs: tuple[Codec, ...] = ("h264",)
     """codecs of the rungs that are written"""
     seed: int = 0
