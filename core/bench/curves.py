@@ -24,10 +24,10 @@ PLAIN = "warm"  # what the gains beyond the paper are measured against
 APART = "apart"  # stands where two curves reach no common quality
 LEGEND = (
     "Bytes against the full method at equal PSNR, PSNR over the pixels of the masks, and SSIM, and against plain warm "
-    "starts at equal PSNR; the best rung's kB per frame with those of its tables, and its quality; PSNR before coding; "
+    "starts at equal PSNR; at QP 20 the kB per frame with those of the tables, and the quality; PSNR before coding; "
     "groups of frames; seconds of training behind the coarse stage."
 )
-NEAR = 0.5  # dB: how far below the best rung a cheaper one is looked for
+NEAR = 0.5  # dB: how far below the top rung a cheaper one is looked for
 RULE = (
     "Every group starts with an IDR frame, since the codes of one mapping table say nothing about those of the next: "
     "without grouping, every frame is an IDR frame. key_frames has the same IDR frames over the full method's tables, "
@@ -55,15 +55,15 @@ def overview(rows: dict[str, Finished]) -> Lines:
         )
     ]
     for row in rows.values():
-        best, frames = row.rungs[0], row.frames
+        top, frames = row.top, row.frames
         lines.append(
             (
                 row.variant.key,
                 *(_change(rows[FULL], row, name) for name in measures),
                 *([_change(plain, row, measures[0])] if plain else []),
-                f"{best['size']['per_frame'] / 1000:.1f}",
-                f"{best['size']['tables'] / frames / 1000:.2f}",
-                *(_quality(name, score(best["scores"], name)) for name in measures),
+                f"{top['size']['per_frame'] / 1000:.1f}",
+                f"{top['size']['tables'] / frames / 1000:.2f}",
+                *(_quality(name, score(top["scores"], name)) for name in measures),
                 _quality("psnr", score(row.model, "psnr")),
                 str(len(row.groups)),
                 f"{row.seconds / frames:.1f}",
@@ -76,15 +76,17 @@ def ladder(row: Finished) -> Lines:
     """Return the rungs of a row: bytes, what they consist of, quality, and the loss to the model before coding."""
     measures = [name for name in MEASURES if name in row.model["mean"]]
     titles = [MEASURES[name] for name in measures]
-    lines: Lines = [("QP", "kB/frame", "of the best", *titles, "loss dB", "video", "tables", "shading", "manifest")]
-    best = row.rungs[0]["size"]["total"]
+    lines: Lines = [
+        ("QP", "kB/frame", f"of QP {row.top['qp']}", *titles, "loss dB", "video", "tables", "shading", "manifest")
+    ]
+    top = row.top["size"]["total"]
     for rung in row.rungs:
         size, scores = rung["size"], rung["scores"]
         lines.append(
             (
                 str(rung["qp"]),
                 f"{size['per_frame'] / 1000:.2f}",
-                f"{size['total'] / best:.2f}",
+                f"{size['total'] / top:.2f}",
                 *(_quality(name, score(scores, name)) for name in measures),
                 f"{score(row.model, 'psnr') - score(scores, 'psnr'):.2f}",
                 *(f"{size[part]:,}" for part in ("video", "tables", "shading", "manifest")),
@@ -95,16 +97,14 @@ def ladder(row: Finished) -> Lines:
 
 
 def remarks(row: Finished) -> list[str]:
-    """Return sentences on a row: its cameras, the cheapest rung that is nearly as good as the best, and drift."""
-    best = row.rungs[0]
-    cameras = ", ".join(f"{name} {_cameras(scores)}" for name, scores in best["scores"]["pooled_cameras"].items())
-    lines = [f"At QP {best['qp']}, by camera: {cameras}."]
-    wanted = score(best["scores"], "psnr") - NEAR
+    """Return sentences on a row: its cameras, the bytes for nearly the top quality, and drift."""
+    top = row.top
+    cameras = ", ".join(f"{name} {_cameras(scores)}" for name, scores in top["scores"]["pooled_cameras"].items())
+    lines = [f"At QP {top['qp']}, by camera: {cameras}."]
+    wanted = score(top["scores"], "psnr") - NEAR
     rate = rate_at(row.curve("psnr"), wanted)
     if rate is not None:
-        lines.append(
-            f"{NEAR} dB below QP {best['qp']} takes {rate * 1000 / best['size']['per_frame']:.2f} of its bytes."
-        )
+        lines.append(f"{NEAR} dB below QP {top['qp']} takes {rate * 1000 / top['size']['per_frame']:.2f} of its bytes.")
     drifts = drift(row)
     if drifts:
         change = ", ".join(f"{first:.2f} to {last:.2f}" for first, last in drifts)
@@ -116,8 +116,8 @@ def remarks(row: Finished) -> list[str]:
 
 
 def drift(row: Finished) -> list[tuple[float, float]]:
-    """Return the mean PSNR of the first and of the last frame of each group of several, from the best rung."""
-    found = [means["psnr"] for means in row.rungs[0]["scores"]["frames"].values()]
+    """Return the mean PSNR of the first and of the last frame of each group of several, from the top rung."""
+    found = [means["psnr"] for means in row.top["scores"]["frames"].values()]
     ends = list(accumulate(frames for frames, _ in row.groups))
     return [
         (found[end - frames], found[end - 1]) for end, (frames, _) in zip(ends, row.groups, strict=True) if frames > 1
@@ -125,8 +125,8 @@ def drift(row: Finished) -> list[tuple[float, float]]:
 
 
 def positions(row: Finished) -> Lines:
-    """Return the mean PSNR and SSIM of the frames at each place in their group, from the best rung."""
-    found = list(row.rungs[0]["scores"]["frames"].values())
+    """Return the mean PSNR and SSIM of the frames at each place in their group, from the top rung."""
+    found = list(row.top["scores"]["frames"].values())
     firsts = [0, *accumulate(frames for frames, _ in row.groups)]
     lines: Lines = [("place in its group", "frames", "PSNR dB", "SSIM")]
     for place in range(max(frames for frames, _ in row.groups)):

@@ -29,6 +29,8 @@ from .variants import FULL, Variant, find_variant, training_of
 
 COARSE_FIELDS = ("coarse", "resolution", "coarse_share", "gamma", "weight_share", "border", "seed")
 
+TOP_QP = 20
+
 OnProgress = Callable[[str, int, int], None]  # what is worked on, what is done of it, and all of it
 
 
@@ -55,6 +57,11 @@ class Finished:
     model: dict[str, Any]
     groups: list[list[int]]
     seconds: float
+
+    @property
+    def top(self) -> dict[str, Any]:
+        """The rung that is spoken of as the video's quality: that of `TOP_QP`, else the best."""
+        return next((rung for rung in self.rungs if rung["qp"] == TOP_QP), self.rungs[0])
 
     @property
     def frames(self) -> int:
