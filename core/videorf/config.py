@@ -65,7 +65,7 @@ class VideoConfig:
     """steps for every other frame"""
     density_rate: float = 0.3
     """Adam's step for raw densities"""
-    feature_rate: float = 0.05
+    feature_rate: float = 0.025
     """Adam's step for features"""
     shading_rate: float = 5e-3
     """Adam's step for the network"""
