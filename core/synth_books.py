@@ -159,6 +159,7 @@ class Books:
     def capture(self) -> Capture:
         job, views = self.job, self.views()
         names = self.camera_names()
+        box = self.scene.get("bounds")
         return Capture(
             cameras=dict(zip(names, self.cameras, strict=True)),
             images={view: self.image(view) for view in views},
@@ -168,7 +169,7 @@ class Books:
             frame_start=job.frames[0],
             depths={view: self.depth(view) for view in views} if job.depth else {},
             seeds={frame: self.seeds(frame) for frame in range(job.frame_count)} if job.seed_points else {},
-            bounds=tuple(map(tuple, bounds)) if (bounds := self.scene.get("bounds")) else None,
+            bounds=(tuple(box[0]), tuple(box[1])) if box else None,
             source=self.out / "transforms.json",
         )
 

@@ -55,8 +55,8 @@ class FrameViews:
             parts.append(_rays_near(self.masks[name], rgba, border))
         if not any(len(part.rgba) for part in parts):
             raise HoloreelError(
-                f"{capture.source}: no camera's mask shows anything in frame {self.number}: give masks that are white where "
-                "the subject is, or leave the frame out."
+                f"{capture.source}: no camera's mask shows anything in frame {self.number}: give masks that are white "
+                "where the subject is, or leave the frame out."
             )
         self.centers = torch.stack([part.origins for part in parts])
         self.camera_of = torch.repeat_interleave(torch.tensor([len(part.rgba) for part in parts]))
