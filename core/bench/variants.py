@@ -56,7 +56,10 @@ def _ablation(part: str) -> Variant:
 VARIANTS = (
     Variant(FULL, "full"),
     *map(_ablation, ABLATIONS),
+    Variant("image_only", "no total variation in space", {"smooth": 0.0}),
+    Variant("space_only", "no total variation of the image", {"spatial": 0.0}),
     Variant("warm", "plain warm start", {"start": "warm"}),
+    Variant("published", "plain warm start, no total variation in space", {"start": "warm", "smooth": 0.0}),
     Variant("coarse", "start from the coarse field alone", {"start": "coarse"}),
     Variant("macroblocks", "blocks in Morton order in squares of 16", {"image_layout": "macroblocks"}),
     Variant("superblocks", "blocks in Morton order in squares of 64", {"image_layout": "superblocks"}),

@@ -286,7 +286,7 @@ class _Training:
             photometric, unsure = self._losses(leaf)
             (gradient,) = torch.autograd.grad(photometric + config.entropy * unsure, leaf)
             decay = config.final_rate ** ((iteration - done) / (end - done))
-            self.optimizer.step(gradient, rates * decay, spatial=config.smooth)
+            self.optimizer.step(gradient, rates * decay, smooth=config.smooth)
             if on_progress and ((iteration + 1) % REPORT_EVERY == 0 or iteration + 1 == config.iterations):
                 on_progress(iteration + 1, -10 * math.log10(max(photometric.item() / 3, 1e-10)))
 

@@ -77,6 +77,9 @@ class VideoConfig:
     """weight of the difference from the frame before, in steps of the quantizer (Eq. 6)"""
     seam: float = 1.0
     """how much differences across the borders of 8 x 8 blocks count among them"""
+    smooth: float = 8e-6
+    """weight of the total variation in space, between neighbors in the lattice, in steps of the quantizer; 0 is the
+    published method"""
     noise_from: float = 0.5
     """from this part of a frame's steps on, rows bear the quantizer's noise; 1: never"""
     random_background: bool = True
@@ -112,7 +115,7 @@ class VideoConfig:
             self._demand(0 <= getattr(self, name) <= 1, name, "0 to 1")
         for name in ("density_rate", "feature_rate", "shading_rate", "final_rate", "density_max", "feature_max"):
             self._demand(getattr(self, name) > 0, name, "more than 0")
-        for name in ("spatial", "temporal", "seam"):
+        for name in ("spatial", "temporal", "seam", "smooth"):
             self._demand(getattr(self, name) >= 0, name, "0 or more")
         self._demand(0 < self.coarse_share <= 1, "coarse_share", "more than 0, at most 1")
         self._demand(0 <= self.image <= 2048 and self.image % 16 == 0, "image", "a multiple of 16 up to 2048, or 0")
@@ -152,12 +155,12 @@ PRESETS = {
         rays=3072,
         coarse=CoarseConfig(iterations=150),
     ),
-    "paper": VideoConfig(start="warm", features=11, frequencies=4, resolution=128, rays=8192),
+    "paper": VideoConfig(start="warm", features=11, frequencies=4, resolution=128, rays=8192, smooth=0.0),
 }
 
 # What each part of the method brings is measured without it (Fig. 7).
 ABLATIONS: dict[str, dict[str, object]] = {
-    "no spatial loss": {"spatial": 0.0},
+    "no spatial loss": {"spatial": 0.0, "smooth": 0.0},
     "no temporal loss": {"temporal": 0.0},
     "no Morton order": {"image_layout": "raster"},
     "no blocks": {"image_layout": "rows"},

@@ -24,7 +24,7 @@ from .mapping import MappingTable
 from .march import Volume, march
 from .model import Rows
 from .occupancy import Lattice
-from .optimize import TableOptimizer, noisy_rows
+from .optimize import TableOptimizer, image_neighbors, joined, lattice_neighbors, noisy_rows
 from .quantize import Ranges
 from .views import FrameViews
 
@@ -110,7 +110,10 @@ class FrameTrainer:
         self.quantum = torch.from_numpy(ranges.step)
         low, high = torch.tensor(ranges.low), torch.tensor(ranges.high)
         before = None if previous is None else torch.from_numpy(np.ascontiguousarray(previous))
-        self.optimizer = TableOptimizer(group.table, self.table, self.quantum, low, high, before)
+        near = image_neighbors(group.table)
+        if config.smooth:
+            near = joined(near, lattice_neighbors(group.table.lookup()))
+        self.optimizer = TableOptimizer(near, self.table, self.quantum, low, high, before)
         self.rates = torch.tensor([config.density_rate, *[config.feature_rate] * config.features])
         self.seen = torch.empty_like(self.table)
         self.offset: Tensor | None = None  # what the codec last made of the rows, less the rows
@@ -139,7 +142,7 @@ class FrameTrainer:
         loss.backward()
         assert table.grad is not None
         rates = self.rates * decay(self.progress, config)
-        self.optimizer.step(table.grad, rates, config.spatial, config.temporal, config.seam)
+        self.optimizer.step(table.grad, rates, config.spatial, config.temporal, config.seam, config.smooth)
         self.iteration += 1
         error = loss.item() / 3
         self.error = error if math.isnan(self.error) else self.error + SMOOTHING * (error - self.error)

@@ -11,7 +11,7 @@ from pathlib import Path
 from ..errors import HoloreelError
 from ..render.native import available_cores
 
-ABI = 3  # VIDEORF_ABI in kernels/api.hpp
+ABI = 4  # VIDEORF_ABI in kernels/api.hpp
 
 
 class CLattice(Structure):
@@ -76,9 +76,10 @@ class CStep(Structure):
     _fields_ = (
         *((name, c_int64) for name in ("rows", "count")),
         *((name, c_int32) for name in ("channels", "neighbors")),
-        *((name, c_void_p) for name in ("values", "mean", "square", "gradient", "previous", "near", "seams")),
+        *((name, c_void_p) for name in ("values", "mean", "square", "gradient", "previous", "near", "kinds")),
         *((name, c_void_p) for name in ("step", "rates", "low", "high")),
-        *((name, c_double) for name in ("spatial", "temporal", "seam", "beta1", "beta2", "epsilon")),
+        ("weights", c_double * 4),
+        *((name, c_double) for name in ("temporal", "beta1", "beta2", "epsilon")),
     )
 
 

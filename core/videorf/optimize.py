@@ -16,15 +16,18 @@ BETAS = (0.9, 0.99)  # of Adam's moments; a frame has few hundred iterations
 EPSILON = 1e-10  # Adam's; the gradient of L_spatial alone, on vertices no ray meets, is about 1e-8
 
 
-class Neighbors(NamedTuple):
-    """What L_spatial compares the N rows with: `rows` (N, K; int32), -1 where there is none.
+INSIDE, SEAM, SPACE = 0, 1, 2  # kinds of pairs: in a block of the image, across the border of two, in the lattice
 
-    Every pair is named from both sides. `seam` (N, K; bool) says which pairs lie across the border of two blocks of the
-    image.
+
+class Neighbors(NamedTuple):
+    """What the N rows are to be like: `rows` (N, K; int32), -1 where there is none, and the `kinds` (N, K; uint8) of
+    these pairs.
+
+    Every pair is named from both sides.
     """
 
     rows: NDArray[np.int32]
-    seam: NDArray[np.bool_]
+    kinds: NDArray[np.uint8]
 
 
 def image_neighbors(mapping: MappingTable) -> Neighbors:
@@ -34,7 +37,7 @@ def image_neighbors(mapping: MappingTable) -> Neighbors:
     found = _around(ranks.reshape(mapping.size))[mapping.pixels]
     row, column = np.divmod(mapping.pixels, mapping.size[1])
     seam = np.stack([edge for at in (row, column) for edge in (at % BLOCK == 0, at % BLOCK == BLOCK - 1)], -1)
-    return Neighbors(np.ascontiguousarray(found), seam & (found >= 0))
+    return Neighbors(np.ascontiguousarray(found), np.where(seam & (found >= 0), SEAM, INSIDE).astype(np.uint8))
 
 
 def lattice_neighbors(lookup: NDArray[np.int32]) -> Neighbors:
@@ -43,7 +46,12 @@ def lattice_neighbors(lookup: NDArray[np.int32]) -> Neighbors:
     occupied = np.flatnonzero(flat >= 0)
     order = occupied[np.argsort(flat[occupied])]
     found = np.ascontiguousarray(_around(lookup)[order])
-    return Neighbors(found, np.zeros(found.shape, bool))
+    return Neighbors(found, np.full(found.shape, SPACE, np.uint8))
+
+
+def joined(first: Neighbors, second: Neighbors) -> Neighbors:
+    """Return the neighbors of both, of the same rows."""
+    return Neighbors(np.hstack((first.rows, second.rows)), np.hstack((first.kinds, second.kinds)))
 
 
 def _around(ranks: NDArray[np.int32]) -> NDArray[np.int32]:
@@ -63,9 +71,10 @@ def _around(ranks: NDArray[np.int32]) -> NDArray[np.int32]:
 class TableOptimizer:
     """Adam on a table's rows, in place, with L_spatial and L_temporal in the same step.
 
-    `neighbors` says what L_spatial compares (a mapping table stands for those in its image). `rows` (N + 1, C; float32)
-    are the raw rows and the row of empty vertices, which never changes. `step` (C) is the quantizer's, `low` and `high`
-    (C) hold the rows in range, `previous` (N, C) is the frame before, or None at the first one of a group.
+    `neighbors` says which rows are to be alike (a mapping table stands for those in its image, L_spatial's). `rows`
+    (N + 1, C; float32) are the raw rows and the row of empty vertices, which never changes. `step` (C) is the
+    quantizer's, `low` and `high` (C) hold the rows in range, `previous` (N, C) is the frame before, or None at the
+    first one of a group.
     """
 
     def __init__(
@@ -82,25 +91,31 @@ class TableOptimizer:
         found = image_neighbors(neighbors) if isinstance(neighbors, MappingTable) else neighbors
         check_step(found, rows, previous)
         count, sides = found.rows.shape
-        if sides > 8 or (found.rows < -1).any() or (found.rows >= count).any():
-            raise ValueError("a row has at most 8 neighbors, and they are rows of the table")
+        if sides > 16 or (found.rows < -1).any() or (found.rows >= count).any():
+            raise ValueError("a row has at most 16 neighbors, and they are rows of the table")
         if rows.dtype != torch.float32 or not rows.is_contiguous() or rows.device.type != "cpu":
             raise ValueError("the rows must be float32, on the processor and without gaps: they change in place")
         self.rows, self.betas, self.epsilon, self.count = rows, betas, epsilon, 0
         self.mean, self.square = torch.zeros_like(rows[:-1]), torch.zeros_like(rows[:-1])
         self._previous = None if previous is None else plain_tensor(previous)
         self._near = np.where(found.rows >= 0, found.rows, np.arange(count, dtype=np.int32)[:, None])
-        self._seams = (found.seam << np.arange(sides, dtype=np.uint8)).sum(1).astype(np.uint8)
+        self._kinds = np.ascontiguousarray(found.kinds, np.uint8)
         self._columns = [plain_tensor(column).expand(rows.shape[1]).contiguous() for column in (step, low, high)]
 
     @torch.no_grad()
     def step(
-        self, gradient: Tensor, rates: Tensor, spatial: float = 0.0, temporal: float = 0.0, seam: float = 1.0
+        self,
+        gradient: Tensor,
+        rates: Tensor,
+        spatial: float = 0.0,
+        temporal: float = 0.0,
+        seam: float = 1.0,
+        smooth: float = 0.0,
     ) -> None:
         """Go one step with the gradient (N + 1, C) of the other losses and a learning rate per channel (C).
 
-        `spatial`, `temporal` and `seam` weigh the losses of `losses.spatial_loss` and `temporal_loss`. The bits do not
-        depend on the number of threads.
+        `spatial`, `temporal` and `seam` weigh the losses of `losses.spatial_loss` and `temporal_loss`, `smooth` the
+        same sum as L_spatial's over pairs in the lattice. The bits do not depend on the number of threads.
         """
         if gradient.shape != self.rows.shape:
             raise ValueError(f"the gradient is {tuple(gradient.shape)}, the rows {tuple(self.rows.shape)}")
@@ -115,17 +130,25 @@ class TableOptimizer:
             self._near.shape[1],
             *(None if tensor is None else tensor.data_ptr() for tensor in tensors),
             self._near.ctypes.data,
-            self._seams.ctypes.data,
+            self._kinds.ctypes.data,
             *(column.data_ptr() for column in (step, rates, low, high)),
-            *(spatial, temporal, seam, *self.betas, self.epsilon),
+            weights_of(spatial, seam, smooth),
+            *(temporal, *self.betas, self.epsilon),
         )
         call("videorf_optimize", request)
+
+
+def weights_of(spatial: float, seam: float, smooth: float) -> tuple[float, float, float, float]:
+    """Return the weight of each kind of pair."""
+    return spatial, spatial * seam, smooth, 0.0
 
 
 def check_step(neighbors: Neighbors, rows: Tensor, previous: Tensor | None) -> None:
     """Raise ValueError where an optimizer's parts do not go together."""
     if rows.ndim != 2 or len(rows) != len(neighbors.rows) + 1:
         raise ValueError(f"the rows are {tuple(rows.shape)}, the neighbors those of {len(neighbors.rows)}")
+    if neighbors.kinds.shape != neighbors.rows.shape or (neighbors.kinds > SPACE).any():
+        raise ValueError("every neighbor has a kind")
     if previous is not None and previous.shape != rows[:-1].shape:
         raise ValueError(f"the rows before are {tuple(previous.shape)}, not {tuple(rows[:-1].shape)}")
 

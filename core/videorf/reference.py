@@ -10,7 +10,7 @@ from torch import Tensor
 
 from .field import DEFAULT_RULES, FieldLattice, Marched, MarchRules, Rays, check_march
 from .mapping import MappingTable
-from .optimize import BETAS, EPSILON, Neighbors, check_step, image_neighbors, noise_key
+from .optimize import BETAS, EPSILON, Neighbors, check_step, image_neighbors, noise_key, weights_of
 
 _CORNERS = [(dx, dy, dz) for dx in (0, 1) for dy in (0, 1) for dz in (0, 1)]
 
@@ -97,21 +97,26 @@ class TableOptimizer:
         self._previous = None if previous is None else previous.to(rows)
         self._step, self._low, self._high = (column.to(rows) for column in (step, low, high))
         self._near = torch.from_numpy(found.rows.astype(np.int64)).to(rows.device)
-        self._seam = torch.from_numpy(found.seam).to(rows.device)
+        self._kinds = torch.from_numpy(found.kinds.astype(np.int64)).to(rows.device)
 
     @torch.no_grad()
     def step(
-        self, gradient: Tensor, rates: Tensor, spatial: float = 0.0, temporal: float = 0.0, seam: float = 1.0
+        self,
+        gradient: Tensor,
+        rates: Tensor,
+        spatial: float = 0.0,
+        temporal: float = 0.0,
+        seam: float = 1.0,
+        smooth: float = 0.0,
     ) -> None:
         """Go one step, as the compiled optimizer does."""
         self.count += 1
         rows, total = self.rows[:-1], gradient[:-1].to(self.rows).clone()
         scale = 1.0 / (self._step * max(len(rows), 1))
-        if spatial:
-            for near, across in zip(self._near.T, self._seam.T, strict=True):
-                weight = torch.where(across, seam, 1.0) * (near >= 0)
-                slope = ((rows - rows[near.clamp(min=0)]) / self._step).clamp(-1, 1)
-                total += spatial * scale * slope * weight.to(rows)[:, None]
+        weights = torch.tensor(weights_of(spatial, seam, smooth), dtype=rows.dtype, device=rows.device)
+        for near, kinds in zip(self._near.T, self._kinds.T, strict=True):
+            slope = ((rows - rows[near.clamp(min=0)]) / self._step).clamp(-1, 1)
+            total += scale * slope * (weights[kinds] * (near >= 0))[:, None]
         if temporal and self._previous is not None:
             total += temporal * scale * ((rows - self._previous) / self._step).clamp(-1, 1)
         b1, b2 = self.betas

@@ -6,13 +6,16 @@ import pytest
 import torch
 from holoreel.core.errors import HoloreelError
 from holoreel.core.videorf import native, reference
-from holoreel.core.videorf.losses import spatial_loss, temporal_loss
+from holoreel.core.videorf.losses import smooth_abs, spatial_loss, temporal_loss
 from holoreel.core.videorf.mapping import LAYOUTS, build_table
 from holoreel.core.videorf.optimize import (
     BETAS,
     EPSILON,
+    INSIDE,
+    SEAM,
     TableOptimizer,
     image_neighbors,
+    joined,
     lattice_neighbors,
     noisy_rows,
 )
@@ -47,9 +50,9 @@ def lanes_or_skip(lanes):
         pytest.skip(f"no {lanes} lanes here")
 
 
-@pytest.mark.parametrize("seam", [1.0, 0.25])
+@pytest.mark.parametrize(("seam", "smooth"), [(1.0, 0.0), (0.25, 0.0), (0.25, 0.05)])
 @pytest.mark.parametrize("layout", LAYOUTS)
-def test_steps_are_those_of_adam_on_the_losses(layout, seam):
+def test_steps_are_those_of_adam_on_the_losses(layout, seam, smooth):
     mapping = table_of(layout)
     rows, previous = rows_of(mapping), rows_of(mapping, 2)[:-1]
     low, high = torch.full((4,), -0.15), torch.full((4,), 0.2)
@@ -61,16 +64,22 @@ def test_steps_are_those_of_adam_on_the_losses(layout, seam):
         betas=BETAS,
         eps=EPSILON,
     )
-    mine = TableOptimizer(mapping, rows, STEP, low, high, previous)
+    around = lattice_neighbors(mapping.lookup())
+    neighbors = joined(image_neighbors(mapping), around) if smooth else mapping
+    mine = TableOptimizer(neighbors, rows, STEP, low, high, previous)
     last, pixels = rows[-1].clone(), torch.from_numpy(mapping.pixels).long()
     generator = torch.Generator().manual_seed(3)
     for _ in range(5):
         gradient = torch.randn(rows.shape, generator=generator) * 1e-4
-        mine.step(gradient, RATES, 0.02, 0.03, seam)
+        mine.step(gradient, RATES, 0.02, 0.03, seam, smooth)
         exact = torch.cat(columns, 1)
         image = exact.new_zeros(64 * 64, 4).index_put((pixels,), exact).reshape(64, 64, 4)
         loss = 0.02 * spatial_loss(image, valid, STEP.double(), seam)
         loss = loss + 0.03 * temporal_loss(exact, previous.double(), STEP.double())
+        for near in torch.from_numpy(around.rows[:, ::2]).long().T:  # every pair from one of its sides
+            there = near >= 0
+            apart = (exact[there] - exact[near[there]]) / STEP.double()
+            loss = loss + smooth * smooth_abs(apart).sum() / mapping.count
         loss = loss + (exact * gradient[:-1].double()).sum()
         adam.zero_grad()
         loss.backward()
@@ -86,11 +95,12 @@ def test_steps_are_those_of_adam_on_the_losses(layout, seam):
 
 @pytest.mark.parametrize("lanes", [4, 8])
 @pytest.mark.parametrize("channels", [2, 4, 7, 8, 13, 16])
-@pytest.mark.parametrize("space", [False, True])
+@pytest.mark.parametrize("space", [False, True, None])
 def test_kernels_are_the_twin(channels, lanes, space):
     lanes_or_skip(lanes)
     mapping = table_of()
-    neighbors = lattice_neighbors(mapping.lookup()) if space else image_neighbors(mapping)
+    around, beside = lattice_neighbors(mapping.lookup()), image_neighbors(mapping)
+    neighbors = joined(beside, around) if space is None else around if space else beside
     generator = torch.Generator().manual_seed(channels)
     step, rates = torch.rand(channels, generator=generator) + 0.1, torch.rand(channels, generator=generator) * 0.1
     rows = torch.randn(mapping.count + 1, channels, generator=generator)
@@ -101,7 +111,7 @@ def test_kernels_are_the_twin(channels, lanes, space):
     for _ in range(4):
         gradient = torch.randn(rows.shape, generator=generator) * 1e-3
         for optimizer in (mine, twin):
-            optimizer.step(gradient, rates, 0.5, 0.3, 0.4)
+            optimizer.step(gradient, rates, 0.5, 0.3, 0.4, 0.7)
     # Adam makes full steps of gradients that are nearly 0: single values may differ by more than rounding.
     assert (rows - exact).norm() < 1e-5 * (exact - start).norm()
     assert torch.allclose(
@@ -144,8 +154,7 @@ def test_neighbors_are_mutual_and_next_to_each_other():
         assert (column[other] - column[has] == right).all()
         assert (neighbors.rows[other, side ^ 1] == np.flatnonzero(has)).all()
         apart = (row[other] // 8 != row[has] // 8) | (column[other] // 8 != column[has] // 8)
-        assert (neighbors.seam[has, side] == apart).all()
-        assert not neighbors.seam[~has, side].any()
+        assert (neighbors.kinds[has, side] == np.where(apart, SEAM, INSIDE)).all()
     assert (neighbors.rows >= 0).sum() > 3 * mapping.count
 
 

@@ -188,6 +188,7 @@ def test_progress_counts_all_steps_up(capture: Capture, tmp_path: Path) -> None:
     ("changes", "says"),
     [
         ({"spatial": 1e-3}, lambda model, other: variation(model, 1) < 0.8 * variation(other, 1)),
+        ({"smooth": 1e-3}, lambda model, other: variation(model, 1) < 0.8 * variation(other, 1)),
         ({"temporal": 1e-2}, lambda model, other: differences(model, 1) < 0.8 * differences(other, 1)),
         ({"grouping": False}, lambda model, other: [group.count for group in model.groups] == [1] * FRAMES),
         ({"image_layout": "rows"}, lambda model, other: model.tables[0].layout == "rows"),

@@ -48,7 +48,7 @@ const TableKernels& table_kernels(int channels) {
 }
 
 void check(const VideorfStep& step) {
-    if (step.rows < 0 || step.rows > INT32_MAX || step.neighbors < 0 || step.neighbors > 8 || step.count < 1)
+    if (step.rows < 0 || step.rows > INT32_MAX || step.neighbors < 0 || step.neighbors > 16 || step.count < 1)
         throw std::invalid_argument("the rows, the neighbors or the count of an optimizer's step are out of range");
 }
 

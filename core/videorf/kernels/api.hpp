@@ -4,7 +4,7 @@
 
 #include <cstdint>
 
-#define VIDEORF_ABI 3
+#define VIDEORF_ABI 4
 #define VIDEORF_API extern "C" __attribute__((visibility("default")))
 
 // Vertices lowest + spacing * (i, j, k); lookup (X, Y, Z) holds the row of each in the table, -1 where it is empty. The table
@@ -55,16 +55,16 @@ struct VideorfPicture {
 };
 
 // One step of Adam on `rows` rows of `channels` values (1 to 16), with the gradients of the losses between each row and its
-// `neighbors` (at most 8), and between it and `previous` (rows, channels; may be null). `near` (rows, neighbors) is not checked;
-// a row stands for itself where there is no neighbor. Bit k of `seams` (rows) says that neighbor k lies across a seam. step,
-// rates, low, high: per channel.
+// `neighbors` (at most 16), and between it and `previous` (rows, channels; may be null). `near` (rows, neighbors) is not checked;
+// a row stands for itself where there is no neighbor. `kinds` (rows, neighbors; 0 to 3) says which of the weights a pair has.
+// step, rates, low, high: per channel.
 struct VideorfStep {
     int64_t rows, count;  // `count` steps, with this one
     int32_t channels, neighbors;
     float *values, *mean, *square;
     const float *gradient, *previous;
     const int32_t* near;
-    const uint8_t* seams;
+    const uint8_t* kinds;
     const float *step, *rates, *low, *high;
-    double spatial, temporal, seam, beta1, beta2, epsilon;
+    double weights[4], temporal, beta1, beta2, epsilon;
 };

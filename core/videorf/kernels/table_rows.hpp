@@ -40,12 +40,13 @@ template <int C, bool kWhole> void moments_of_rows(const VideorfStep& s, int64_t
     const Rows<C, kWhole> rows{s.channels};
     const double count = static_cast<double>(s.rows);
     const Row zero = {}, one = zero + 1.0f, step = rows.load_one(s.step), per_step = one / step;
-    const Row spatial = static_cast<float>(s.spatial / count) * per_step;
     const Row temporal = static_cast<float>(s.temporal / count) * per_step;
     const float beta1 = static_cast<float>(s.beta1), rest1 = static_cast<float>(1 - s.beta1);
     const float beta2 = static_cast<float>(s.beta2), rest2 = static_cast<float>(1 - s.beta2);
-    const float weights[2] = {1.0f, static_cast<float>(s.seam)};
-    const bool with_space = s.spatial != 0 && s.neighbors > 0, with_time = s.temporal != 0 && s.previous;
+    float weights[4];
+    for (int kind = 0; kind < 4; kind++) weights[kind] = static_cast<float>(s.weights[kind] / count);
+    const bool with_space = s.neighbors > 0 && (weights[0] != 0 || weights[1] != 0 || weights[2] != 0 || weights[3] != 0);
+    const bool with_time = s.temporal != 0 && s.previous;
     for (int64_t row = first; row < last; row++) {
         const Row here = rows.load(s.values, row);
         Row total = rows.load(s.gradient, row);
@@ -53,9 +54,9 @@ template <int C, bool kWhole> void moments_of_rows(const VideorfStep& s, int64_t
             Row slope = zero;
             for (int k = 0; k < s.neighbors; k++) {
                 const Row there = rows.load(s.values, s.near[row * s.neighbors + k]);
-                slope += weights[s.seams[row] >> k & 1] * held((here - there) * per_step, -one, one);
+                slope += weights[s.kinds[row * s.neighbors + k] & 3] * held((here - there) * per_step, -one, one);
             }
-            total += spatial * slope;
+            total += per_step * slope;
         }
         if (with_time) total += temporal * held((here - rows.load(s.previous, row)) * per_step, -one, one);
         rows.store(s.mean, row, beta1 * rows.load(s.mean, row) + rest1 * total);
