@@ -146,7 +146,10 @@ class _Lenses:
         self._map: LensMap | None = None
 
     def picture(self, name: str, frame: int, background: tuple[float, float, float] | None) -> Picture:
-        picture = self._capture.image(name, frame, background)
+        if background is None and (name, frame) in self._capture.masks:
+            picture = self._capture.rgba(name, frame)
+        else:
+            picture = self._capture.image(name, frame, background)
         if self._name != name:
             source, target = self._capture.cameras[name], self._targets[name]
             self._name, self._map = name, None if same_lens(source, target) else lens_map(source, target)

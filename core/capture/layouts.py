@@ -52,7 +52,8 @@ def _write_nerfstudio(capture: Capture, path: Path, export: Export) -> None:
     if capture.depths:
         export.notes.append("Depth maps are not taken along.")
     images: dict[View, Media] = {view: place(*view) for view in capture.images}
-    nerfstudio.write_capture(path, replace(capture, cameras=lenses, images=images, seeds=seeds, depths={}))
+    written = replace(capture, cameras=lenses, images=images, seeds=seeds, depths={}, masks={})  # these are alpha now
+    nerfstudio.write_capture(path, written)
 
 
 LAYOUTS = {

@@ -40,7 +40,8 @@ def undistort_capture(
     """Write pictures of cameras with distortion as their `pinhole_of` sees them, and return the capture of those.
 
     PNGs go to OUT/CAMERA/FRAME.png, black where the lens saw nothing; those that are there already are kept. Pictures
-    of PINHOLE cameras stay where they are. Depth maps of rectified cameras are left out; seed points hold as before.
+    of PINHOLE cameras stay where they are. Depth maps and masks of rectified cameras are left out, as their pixels lie
+    elsewhere; seed points hold as before.
     """
     distorted = {name: camera for name, camera in capture.cameras.items() if camera.model != "PINHOLE"}
     cameras = capture.cameras | {name: pinhole_of(camera, focal) for name, camera in distorted.items()}
@@ -57,4 +58,5 @@ def undistort_capture(
             write_png(path, lens[1].apply(capture.image(name, frame)).astype(np.float32) / 255)
         images[name, frame] = path
     depths = {view: path for view, path in capture.depths.items() if view[0] not in distorted}
-    return replace(capture, cameras=cameras, images=images, depths=depths)
+    masks = {view: media for view, media in capture.masks.items() if view[0] not in distorted}
+    return replace(capture, cameras=cameras, images=images, depths=depths, masks=masks)

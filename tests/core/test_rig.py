@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from holoreel.core.camera import Camera
 from holoreel.core.errors import HoloreelError
-from holoreel.core.rig import RigRequest, RigSettings, SceneFacts, fit_to_scene, make_rig
+from holoreel.core.rig import RigRequest, RigSettings, SceneFacts, fit_to_scene, make_rig, request
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -49,6 +49,22 @@ def test_arc_by_hand() -> None:
     heights = np.degrees(np.arcsin(centers[:, 2] / 5))
     assert np.allclose(heights, [0, 4, -4, 4, -4])
     assert [camera.name for camera in cameras] == ["cam00", "cam01", "cam02", "cam03", "cam04"]
+
+
+def test_dome_surrounds_and_aims() -> None:
+    wanted = request("dome", 20, 64, 64, target=(0, 0, 1), radius=3.0, fov_degrees=40, azimuth_degrees=None)
+    cameras = make_rig("dome", fit_to_scene(wanted, SceneFacts()))
+    offsets = np.array([camera.center for camera in cameras]) - (0, 0, 1)
+    assert np.allclose(np.linalg.norm(offsets, axis=1), 3)
+    assert all(np.allclose(camera.project([(0, 0, 1)])[0], (32, 32)) for camera in cameras)
+    elevations = np.degrees(np.arcsin(offsets[:, 2] / 3))
+    assert (np.diff(elevations) > 0).all()
+    assert -5 < elevations[0] < 0
+    assert 60 < elevations[-1] < 65
+    for start in range(16):  # any five in a row look from all sides
+        azimuths = np.sort(np.degrees(np.arctan2(offsets[start : start + 5, 1], offsets[start : start + 5, 0])))
+        assert np.diff([*azimuths, azimuths[0] + 360]).max() < 140
+    assert request("arc", 3, 8, 8) == RigRequest(3, 8, 8)
 
 
 @pytest.mark.parametrize("count", [3, 4, 12, 21])
