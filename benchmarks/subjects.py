@@ -19,7 +19,7 @@ from holoreel.benchmarks.stage import import_subject, put_on_floor
 
 FRAMES = range(1, 49)  # that the distance of the cameras allows for
 FOV = 40.0
-FILL = 0.78  # of the sphere around the subject's box is in the picture; its middle stays, and so do all its points
+FILL = 0.78  # of the sphere around the subject's box fits into a picture: enough for a figure that stands upright
 GLOSS = {"Roughness": 0.28, "Specular IOR Level": 0.9, "Coat Weight": 0.7, "Coat Roughness": 0.22}
 LAMPS = (  # color, place in radii of the subject, watts per square radius
     ((1.0, 0.55, 0.3), (-2.2, -1.6, 1.4), 90.0),
@@ -91,13 +91,19 @@ def main() -> None:
     parser.add_argument("--clip", required=True, help="name of the action to play, over and over")
     parser.add_argument("--hide", nargs="*", default=[], help="objects of the file to leave out")
     parser.add_argument("--glossy", action="store_true", help="polish the subject, and add colored lamps")
+    parser.add_argument(
+        "--fill",
+        type=float,
+        default=FILL,
+        help="share of the sphere around the subject in the picture; 1 for long ones",
+    )
     parser.add_argument("--out", type=Path, required=True)
     arguments = parser.parse_args()
     low, high = build(arguments.subject, arguments.clip, arguments.hide, arguments.glossy)
     arguments.out.parent.mkdir(parents=True, exist_ok=True)
     bpy.ops.wm.save_as_mainfile(filepath=str(arguments.out.resolve()), compress=True)
     target = [f"{value:.4f}" for value in (low + high) / 2]
-    radius = FILL * float(np.linalg.norm(high - low)) / 2 / math.sin(math.radians(FOV) / 2)
+    radius = arguments.fill * float(np.linalg.norm(high - low)) / 2 / math.sin(math.radians(FOV) / 2)
     print(
         f"holoreel synth {shlex.quote(str(arguments.out))} --out CAPTURE --frames 1:24 --rig dome --cameras 20 "
         f"--size 256x256 --film transparent --holdout 6 13 --seed-points 0 --samples 24 --fov {FOV:g} "
