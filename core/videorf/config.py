@@ -71,34 +71,34 @@ class VideoConfig:
     """Adam's step for the network"""
     final_rate: float = 0.05
     """all rates decay to this part of themselves over a frame"""
-    spatial: float = 8e-6
+    spatial: float = 2e-6
     """weight of the total variation of the feature image, in steps of the quantizer (Eq. 5)"""
-    temporal: float = 1e-5
+    temporal: float = 5e-6
     """weight of the difference from the frame before, in steps of the quantizer (Eq. 6)"""
     seam: float = 1.0
     """how much differences across the borders of 8 x 8 blocks count among them"""
-    smooth: float = 8e-6
+    smooth: float = 6e-6
     """weight of the total variation in space, between neighbors in the lattice, in steps of the quantizer; 0 is the
     published method"""
     noise_from: float = 0.5
     """from this part of a frame's steps on, rows bear the quantizer's noise; 1: never"""
     random_background: bool = True
     """lay pictures over another color at every ray, so that no background is learned; else over white"""
-    density_max: float = 16.0
+    density_max: float = 8.0
     """raw densities stay under this"""
-    feature_max: float = 2.0
+    feature_max: float = 1.0
     """features stay between minus this and this"""
     step: float = 0.5
     """of the ray march, in spacings"""
     transmittance_min: float = 1e-4
     """a ray ends when it is this dark"""
-    codec_from: float = 1.0
+    codec_from: float = 0.7
     """from this part of a frame's steps on, rows are seen through a real codec; 1: never"""
-    codec_qp: int = 24
-    """the QP of that codec"""
-    codec_every: int = 32
+    codec_qps: tuple[int, ...] = (24, 28, 32, 36)
+    """the QPs of that codec, one after the other: rows are then good at all of them"""
+    codec_every: int = 8
     """steps between two passes through it"""
-    qps: tuple[int, ...] = (20, 24, 28, 32, 36)
+    qps: tuple[int, ...] = (20, 24, 28, 33, 36)
     """constant QPs of the rungs that are written, on the codec's own scale; a player begins with the first"""
     codecs: tuple[Codec, ...] = ("h264",)
     """codecs of the rungs that are written"""
@@ -155,7 +155,19 @@ PRESETS = {
         rays=3072,
         coarse=CoarseConfig(iterations=150),
     ),
-    "paper": VideoConfig(start="warm", features=11, frequencies=4, resolution=128, rays=8192, smooth=0.0),
+    "paper": VideoConfig(
+        start="warm",
+        features=11,
+        frequencies=4,
+        resolution=128,
+        rays=8192,
+        density_max=16.0,
+        feature_max=2.0,
+        spatial=8e-6,
+        temporal=1e-5,
+        smooth=0.0,
+        codec_from=1.0,
+    ),
 }
 
 # What each part of the method brings is measured without it (Fig. 7).

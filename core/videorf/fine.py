@@ -31,7 +31,7 @@ from .views import FrameViews
 SMOOTHING = 0.05  # of the error that is reported: the share of the newest step
 BETAS = (0.9, 0.99)  # of the network's Adam
 
-RoundTrip = Callable[[Rows], Rows]  # rows (N, C) as a decoder returns them
+RoundTrip = Callable[[Rows, int], Rows]  # rows (N, C) as a decoder returns them at a QP
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,6 +117,7 @@ class FrameTrainer:
         self.rates = torch.tensor([config.density_rate, *[config.feature_rate] * config.features])
         self.seen = torch.empty_like(self.table)
         self.offset: Tensor | None = None  # what the codec last made of the rows, less the rows
+        self.trips = 0  # through the codec
 
     @property
     def rows(self) -> Rows:
@@ -157,8 +158,9 @@ class FrameTrainer:
         config = self.config
         if self.round_trip is not None and self.progress >= config.codec_from:
             if self.offset is None or self.iteration % config.codec_every == 0:
-                rows = self.rows
-                self.offset = torch.from_numpy(self.round_trip(rows) - rows)
+                rows, qp = self.rows, config.codec_qps[self.trips % len(config.codec_qps)]
+                self.offset = torch.from_numpy(self.round_trip(rows, qp) - rows)
+                self.trips += 1
             torch.add(self.table[:-1], self.offset, out=self.seen[:-1])
             self.seen[-1] = self.table[-1]
             return self.seen.detach()

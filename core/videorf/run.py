@@ -426,14 +426,14 @@ class _Run:
 
 
 def through_codec(table: MappingTable, previous: Rows | None, config: VideoConfig) -> RoundTrip:
-    """Return the way of a frame's rows (N, C) through the codec: coded behind the frame before, where there is one."""
+    """Return the way of a frame's rows (N, C) through the codec at a QP, behind the frame before where there is one."""
     ranges = config.ranges
     tiling = tiling_of(config.profile, config.features + 1, *table.size)
     empty = ranges.encode(ranges.empty)
     before = [] if previous is None else [table.to_image(ranges.encode(previous), empty)]
 
-    def trip(rows: Rows) -> Rows:
-        images, _ = round_trip([*before, table.to_image(ranges.encode(rows), empty)], tiling, config.codec_qp)
+    def trip(rows: Rows, qp: int) -> Rows:
+        images, _ = round_trip([*before, table.to_image(ranges.encode(rows), empty)], tiling, qp)
         return ranges.decode(table.to_rows(images[-1]))
 
     return trip

@@ -79,7 +79,7 @@ def test_variants_are_joined():
     assert both.how == find_variant("av1").how
     assert (both.key, training_of(both)) == ("superblocks+av1", "superblocks")
     assert training_of(find_variant("hevc+percentile")) == "full"
-    assert training_of(find_variant("hevc+warm+key_frames+density_8")) == "warm+density_8"
+    assert training_of(find_variant("hevc+warm+key_frames+density_16")) == "warm+density_16"
     assert find_variant("full+hevc") == find_variant("hevc")
     with pytest.raises(HoloreelError, match="there is no row 'colour'; take some of full, no_spatial_loss"):
         find_variant("hevc+colour")

@@ -304,11 +304,11 @@ def test_the_network_changes_only_where_it_learns(ready: tuple[GroupField, Frame
 
 def test_the_codec_is_asked_as_often_as_told(ready: tuple[GroupField, FrameViews, np.ndarray]) -> None:
     field, views, start = ready
-    config = replace(SHORT, codec_from=0.5, codec_every=4, density_rate=0.01)
-    asked: list[int] = []
+    config = replace(SHORT, codec_from=0.5, codec_every=4, codec_qps=(20, 30), density_rate=0.01)
+    asked: list[tuple[int, int]] = []
 
-    def trip(rows: np.ndarray) -> np.ndarray:
-        asked.append(trainer.iteration)
+    def trip(rows: np.ndarray, qp: int) -> np.ndarray:
+        asked.append((trainer.iteration, qp))
         return rows + 0.25
 
     trainer = FrameTrainer(field, views, 0, start, None, config, 20, trip)
@@ -316,21 +316,20 @@ def test_the_codec_is_asked_as_often_as_told(ready: tuple[GroupField, FrameViews
     table = trainer._table()
     assert torch.allclose(table[:-1], trainer.table[:-1] + 0.25)
     assert torch.equal(table[-1], trainer.table[-1])
-    trainer.iteration, trainer.offset = 0, None
+    trainer.iteration, trainer.offset, trainer.trips = 0, None, 0
     asked.clear()
     train_frames([trainer], new_network(config), False)
-    assert asked == [10, 12, 16]
+    assert asked == [(10, 20), (12, 30), (16, 20)]
 
 
 def test_the_way_through_the_codec_is_that_of_a_reel(trained: TrainedVideo) -> None:
     """What the loop sees of a group's first two frames is what a player decodes of them."""
     model, reel = trained.model, trained.reel
-    config = replace(SHORT, codec_qp=20)
     decoded = {frame: rows for frame, _, rows in decoded_rows(reel, 0)}
     assert model.groups[0].count > 1
-    head = through_codec(model.tables[0], None, config)(model.rows(0))
+    head = through_codec(model.tables[0], None, SHORT)(model.rows(0), 20)
     assert np.array_equal(head, decoded[0])
-    second = through_codec(model.tables[0], model.rows(0), config)(model.rows(1))
+    second = through_codec(model.tables[0], model.rows(0), SHORT)(model.rows(1), 20)
     assert np.array_equal(second, decoded[1])
 
 
