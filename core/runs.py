@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""What training runs on disk have in common. Needs numpy only."""
+"""What training runs have in common. Needs numpy only to be imported."""
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 
 from .errors import HoloreelError
@@ -32,6 +33,19 @@ def claim_run(reel: Path, checkpoint: Path, resume: bool) -> None:
         )
     if resume and not checkpoint.exists():
         raise HoloreelError(f"{checkpoint}: no checkpoint to resume from; leave --resume away to start anew.")
+
+
+@contextmanager
+def one_torch_thread() -> Iterator[None]:
+    """Keep torch's own threads asleep: they spin while they wait, beside the kernels' threads and at their cost."""
+    import torch
+
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)
 
 
 def differences(old: Mapping, new: Mapping, ignored: tuple[str, ...] = (), prefix: str = "") -> list[str]:

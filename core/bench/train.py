@@ -24,6 +24,7 @@ from ..images import write_png
 from ..render import get_backend
 from ..render.contract import SpacetimeTensors
 from ..render.scenes import random_scene
+from ..runs import one_torch_thread
 from .raster import RASTER_PARTS
 
 VIEWS, FRAMES = 4, 5
@@ -84,7 +85,7 @@ def measure(setup: Setup, preset: str, rounds: int, backend: str = "auto") -> Ro
     module = get_backend(backend)  # type: ignore[arg-type]
     config = replace(PRESETS[preset], iterations=100_000, max_seeds=setup.gaussians)
     columns = 9 if config.model == "full" else 3
-    with tempfile.TemporaryDirectory() as folder, _quiet_torch():
+    with tempfile.TemporaryDirectory() as folder, one_torch_thread():
         capture, seeds = synthetic_capture(setup, columns, Path(folder), get_backend("auto"))
         watched = _Watched(module)
         trainer = Trainer(capture, config, watched, seeds)  # type: ignore[arg-type]
@@ -121,17 +122,6 @@ def synthetic_capture(
     arrays = {name: value.numpy() for name, value in zip(SpacetimeTensors._fields, truth, strict=True)}
     arrays["features"] = random.uniform(0, 1, (setup.gaussians, columns)).astype(np.float32)
     return Capture(cameras, images, FRAMES, source=folder), SpacetimeGaussians(**arrays)
-
-
-class _quiet_torch:  # noqa: N801
-    """Torch's own threads asleep, as the trainer keeps them during a run."""
-
-    def __enter__(self) -> None:
-        self.threads = torch.get_num_threads()
-        torch.set_num_threads(1)
-
-    def __exit__(self, *_: object) -> None:
-        torch.set_num_threads(self.threads)
 
 
 class _Watched:

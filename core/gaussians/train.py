@@ -21,6 +21,7 @@ from ..capture.stream import PictureStream
 from ..errors import HoloreelError
 from ..render.contract import Rendering, Rules
 from ..render.view import DecoderTensors, render_view
+from ..runs import one_torch_thread
 from .config import TrainConfig
 from .decoder import SHAPES, Decoder
 from .density import SETTINGS, DensityControl
@@ -56,17 +57,6 @@ class Progress:
     psnr: float
     gaussians: int
     seconds_left: float
-
-
-@contextmanager
-def _single_threaded_torch() -> Iterator[None]:
-    """Keep torch's own threads asleep: they spin while they wait, beside the kernels' threads and at their cost."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(threads)
 
 
 @contextmanager
@@ -180,7 +170,7 @@ class Trainer:
         Ctrl-C raises KeyboardInterrupt between two steps, so that `state` is whole.
         """
         until = self.config.iterations if until is None else min(until, self.config.iterations)
-        with _single_threaded_torch(), _interrupts_between_steps() as check_interrupt:
+        with one_torch_thread(), _interrupts_between_steps() as check_interrupt:
             self._run(on_progress, check_interrupt, until, every)
 
     def _run(

@@ -4,8 +4,7 @@
 import math
 import zipfile
 import zlib
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -17,6 +16,7 @@ from torch import Tensor
 
 from ..errors import HoloreelError
 from ..files import atomic_path
+from ..runs import one_torch_thread
 from . import morton
 from .field import FieldLattice, MarchRules, Rays
 from .hull import REACH, visual_hull
@@ -233,17 +233,6 @@ def wider(lattice: Lattice) -> Lattice:
     """Return a lattice of twice the spacing that covers the same box."""
     x, y, z = (max(2, edge // 2 + 1) for edge in lattice.shape)
     return Lattice((x, y, z), lattice.lowest, 2 * lattice.spacing)
-
-
-@contextmanager
-def one_torch_thread() -> Iterator[None]:
-    """Keep torch to one thread: its idle ones would spin on the cores of the march."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(threads)
 
 
 class _Training:

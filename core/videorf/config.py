@@ -120,8 +120,9 @@ class VideoConfig:
         self._demand(0 < self.coarse_share <= 1, "coarse_share", "more than 0, at most 1")
         self._demand(0 <= self.image <= 2048 and self.image % 16 == 0, "image", "a multiple of 16 up to 2048, or 0")
         self._demand(self.headroom >= 1, "headroom", "1 or more")
-        for name in ("qps", "codecs"):
+        for name in ("qps", "codecs", "codec_qps"):
             self._demand(len(getattr(self, name)) > 0, name, "at least one")
+        self._demand(all(0 <= qp <= 51 for qp in self.codec_qps), "codec_qps", "0 to 51, which H.264 has")
 
     def _demand(self, right: bool, name: str, wanted: str) -> None:
         if not right:

@@ -24,8 +24,8 @@ import torch
 from ..capture import Capture
 from ..errors import HoloreelError
 from ..files import atomic_path, read_json, write_json
-from ..runs import claim_run, differences
-from .coarse import Coarse, occupancy_of, one_torch_thread
+from ..runs import claim_run, differences, one_torch_thread
+from .coarse import Coarse, occupancy_of
 from .coarse_frames import CoarseJob, train_coarse_frames
 from .codec import check_rung
 from .config import VideoConfig

@@ -136,6 +136,8 @@ def test_settings_name_what_is_wrong_with_them() -> None:
         ("image", 100),
         ("headroom", 0.9),
         ("qps", ()),
+        ("codec_qps", ()),
+        ("codec_qps", (20, 52)),
         ("density_rate", 0.0),
         ("coarse_share", 0.0),
     ):
