@@ -1,18 +1,22 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Blender side: building blocks. Nothing is imported before `register`."""
 
+from types import ModuleType
+
+
+def _modules() -> tuple[ModuleType, ...]:
+    from .. import operators, panels
+
+    return operators, panels
+
 
 def register() -> None:
     """Register operators, then the panels that show them."""
-    from .. import operators, panels
-
-    operators.register()
-    panels.register()
+    for module in _modules():
+        module.register()
 
 
 def unregister() -> None:
     """Take everything out again, in reverse."""
-    from .. import operators, panels
-
-    panels.unregister()
-    operators.unregister()
+    for module in reversed(_modules()):
+        module.unregister()

@@ -1,18 +1,22 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """What a user does, one file per deed."""
 
+from types import ModuleType
+
+
+def _modules() -> tuple[ModuleType, ...]:
+    from . import import_reel, setup_exact_render
+
+    return import_reel, setup_exact_render
+
 
 def register() -> None:
     """Register all operators and their menu entries."""
-    from . import import_reel, setup_exact_render
-
-    import_reel.register()
-    setup_exact_render.register()
+    for module in _modules():
+        module.register()
 
 
 def unregister() -> None:
     """Take them out again, in reverse."""
-    from . import import_reel, setup_exact_render
-
-    setup_exact_render.unregister()
-    import_reel.unregister()
+    for module in reversed(_modules()):
+        module.unregister()

@@ -1,16 +1,22 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Where a user looks, one file per place."""
 
+from types import ModuleType
+
+
+def _modules() -> tuple[ModuleType, ...]:
+    from . import reel
+
+    return (reel,)
+
 
 def register() -> None:
     """Register all panels."""
-    from . import reel
-
-    reel.register()
+    for module in _modules():
+        module.register()
 
 
 def unregister() -> None:
-    """Take them out again."""
-    from . import reel
-
-    reel.unregister()
+    """Take them out again, in reverse."""
+    for module in reversed(_modules()):
+        module.unregister()

@@ -25,9 +25,9 @@ class Layout:
     read: Callable[[Path, CaptureOptions], Capture]
     write: Callable[[Capture, Path, Export], None]
     scale: int = 1  # by which the protocol divides the size of the pictures
-    held_out: str | None = ""  # the camera to test on; the first where there is none of that name; None: the files say
+    held_out: tuple[str, ...] | None = ()  # cameras to test on; the first where none has these names; None: files say
     holds_seeds: bool = False
-    keeps_names: bool = False  # of cameras; the others number them, the held-out one in the place of `held_out`
+    keeps_names: bool = False  # of cameras; the others number them, held-out ones in the places of `held_out`
 
 
 def _read_nerfstudio(path: Path, options: CaptureOptions) -> Capture:
@@ -72,7 +72,7 @@ LAYOUTS = {
         technicolor.matches,
         technicolor.read,
         technicolor.write,
-        held_out=technicolor.HELD_OUT,
+        held_out=(technicolor.HELD_OUT,),
     ),
     "immersive": Layout(
         "models.json and a video per camera",
@@ -80,7 +80,7 @@ LAYOUTS = {
         immersive.read,
         immersive.write,
         scale=2,
-        held_out=immersive.HELD_OUT,
+        held_out=(immersive.HELD_OUT,),
     ),
     "colmap": Layout(
         "images and sparse/0, or folders colmap_FRAME",
@@ -173,7 +173,7 @@ def _splits(capture: Capture, options: CaptureOptions, layout: Layout) -> dict[s
     elif len(capture.cameras) == 1:
         held_out = []
     else:
-        held_out = [layout.held_out if layout.held_out in capture.cameras else next(iter(capture.cameras))]
+        held_out = [name for name in layout.held_out if name in capture.cameras] or [next(iter(capture.cameras))]
     return {name: "test" if name in held_out else "train" for name in capture.cameras}
 
 
