@@ -92,9 +92,9 @@ class VideoConfig:
     """of the ray march, in spacings"""
     transmittance_min: float = 1e-4
     """a ray ends when it is this dark"""
-    codec_from: float = 0.7
+    codec_from: float = 0.8
     """from this part of a frame's steps on, rows are seen through a real codec; 1: never"""
-    codec_qps: tuple[int, ...] = (24, 28, 32, 36)
+    codec_qps: tuple[int, ...] = (20, 24, 28, 32, 36)
     """the QPs of that codec, one after the other: rows are then good at all of them"""
     codec_every: int = 8
     """steps between two passes through it"""
