@@ -60,7 +60,8 @@ def train(capture: Capture, out: Path, resume: bool, workers: int, keep_model: b
             bar.n, bar.total = progress.iteration, progress.iterations
             bar.set_description(progress.stage, refresh=False)
             place = f"{progress.frame + 1}/{progress.frames}"
-            bar.set_postfix(frame=place, psnr=f"{progress.psnr:.2f}", left=f"{progress.seconds_left:.0f}s")
+            quality = {} if progress.psnr is None else {"psnr": f"{progress.psnr:.2f}"}
+            bar.set_postfix(frame=place, **quality, left=f"{progress.seconds_left:.0f}s")
 
         try:
             trained = train_video(capture, out, config, show, resume, workers=workers, keep_model=keep_model)

@@ -97,7 +97,8 @@ class RunPaths:
 class VideoProgress:
     """Where a run stands: `stage` of `STAGES`, the frame worked on (from 0), and steps done of those planned in all.
 
-    `psnr` is that of training rays over random backgrounds, near the subject: lower than that of whole pictures.
+    `psnr` is that of training rays over random backgrounds, near the subject: lower than that of whole pictures; None
+    while nothing is learned.
     """
 
     stage: str
@@ -105,7 +106,7 @@ class VideoProgress:
     frames: int
     iteration: int
     iterations: int
-    psnr: float
+    psnr: float | None
     seconds_left: float
 
 
@@ -217,7 +218,7 @@ class _Run:
 
     # -- what the listener hears
 
-    def _tell(self, stage: str, frame: int, psnr: float, steps: int) -> None:
+    def _tell(self, stage: str, frame: int, psnr: float | None, steps: int) -> None:
         """Say how far the run is after so many more steps."""
         self.done += steps
         worked = max(self.done - self.skipped, 1)
@@ -358,7 +359,7 @@ class _Run:
         """Write the reel and the run's record."""
 
         def tell(done: int, total: int) -> None:
-            self._tell("encode", (done - 1) % self.frames, math.nan, 0)
+            self._tell("encode", (done - 1) % self.frames, None, 0)
 
         with self.clock.of("encode"):
             reel = write_reel(
