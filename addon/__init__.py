@@ -6,8 +6,9 @@ from types import ModuleType
 
 def _modules() -> tuple[ModuleType, ...]:
     from .. import operators, panels
+    from . import preferences
 
-    return operators, panels
+    return preferences, operators, panels
 
 
 def register() -> None:
