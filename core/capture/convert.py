@@ -10,7 +10,7 @@ from ..errors import HoloreelError
 from ..files import read_json, write_json
 from .capture import Capture
 from .export import Export
-from .layouts import LAYOUTS
+from .layouts import LAYOUTS, default_held_out
 from .video_set import natural
 
 _RECORD = "job.json"
@@ -49,9 +49,11 @@ def _note_losses(capture: Capture, to: str, export: Export) -> None:
     if capture.seeds and not layout.holds_seeds:
         export.notes.append("Seed points are not taken along: run `holoreel sfm` on the result.")
     held_out = capture.camera_names("test")
-    default = min(capture.cameras, key=natural) if layout.keeps_names else "".join(held_out[:1])
-    if layout.held_out is not None and held_out != [default]:
+    names = layout.names(capture)
+    wanted = sorted((names[name] for name in held_out), key=natural)
+    default = default_held_out(layout, sorted(names.values(), key=natural))
+    if layout.held_out is not None and set(wanted) != set(default):
         export.notes.append(
-            f"Held out were {', '.join(held_out) or 'no cameras'}, but this layout holds one out by default"
-            f"{', ' + default if default else ''}: name them by --test-cameras."
+            f"Held out were {', '.join(held_out) or 'no cameras'}, but what is read in this layout holds "
+            f"{', '.join(default) or 'none'} out by default: read it with --test-cameras {' '.join(wanted) or 'none'}."
         )

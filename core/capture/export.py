@@ -5,7 +5,7 @@ A file that exists already is taken for written (each appears only when it is wh
 """
 
 import re
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from fractions import Fraction
 from pathlib import Path
@@ -16,10 +16,12 @@ from numpy.typing import NDArray
 from ..camera import Camera
 from ..errors import HoloreelError
 from ..files import atomic_path
-from .capture import Capture
+from .capture import Capture, Triple
+from .images import composite
 from .resample import LensMap, lens_map, same_lens
 
 Picture = NDArray[np.uint8]
+Content = Callable[[Capture, str, int], Picture]  # what is written of a view (camera, frame), before any lens
 _QUALITY = "10"  # x264's constant rate factor: the difference to the source is under the pictures' own noise
 _PNG_LEVEL = 3  # zlib's: twice as fast as the usual 6, a few percent larger
 
@@ -28,7 +30,7 @@ _PNG_LEVEL = 3  # zlib's: twice as fast as the usual 6, a few percent larger
 class Export:
     """How an export is done, and what it has to tell."""
 
-    background: tuple[float, float, float] = (0.0, 0.0, 0.0)  # behind transparent pictures, where a layout has no alpha
+    background: Triple = (0.0, 0.0, 0.0)  # behind transparent pictures, where a layout has no alpha
     on_progress: Callable[[int, int], None] | None = None  # pictures done, and all
     rectify: float | None = None  # make pinholes of lenses with distortion, with this share of their focal length
     notes: list[str] = field(default_factory=list)  # sentences about what the layout could not hold
@@ -65,9 +67,38 @@ def file_names(capture: Capture) -> dict[str, str]:
     return names
 
 
-def held_out_first(capture: Capture) -> list[str]:
-    """Return the cameras' names, the held-out ones first."""
-    return [*capture.camera_names("test"), *capture.camera_names("train")]
+def numbered(capture: Capture, names: Sequence[str], held_out: Sequence[str]) -> dict[str, str]:
+    """Return which of `names`, one for each camera, each camera gets, in the order of `names`.
+
+    Held-out cameras get the names in `held_out`, as far as both go, or the first one where it has none of `names`: what
+    readers of a layout hold out by default. All others get the remaining names in order.
+    """
+    places = [name for name in held_out if name in names] or names[:1]
+    test = capture.camera_names("test")
+    given = dict(zip(places, test, strict=False))
+    others = iter([*test[len(given) :], *capture.camera_names("train")])
+    return {given[name] if name in given else next(others): name for name in names}
+
+
+def over(background: Triple) -> Content:
+    """The pictures, over a color where they are transparent."""
+    return lambda capture, name, frame: capture.image(name, frame, background)
+
+
+def with_alpha(capture: Capture, name: str, frame: int) -> Picture:
+    """The picture with straight alpha, from its mask where it has one; without alpha where it has neither."""
+    masked = (name, frame) in capture.masks
+    return capture.rgba(name, frame) if masked else capture.image(name, frame)
+
+
+def subject_over(background: Triple) -> Content:
+    """The subject alone over a color, from masks or transparency."""
+    return lambda capture, name, frame: composite(capture.rgba(name, frame), background)
+
+
+def subject_mask(capture: Capture, name: str, frame: int) -> Picture:
+    """How much of each pixel the subject covers, as gray (H, W, 3)."""
+    return np.repeat(capture.rgba(name, frame)[..., 3:], 3, axis=2)
 
 
 def write_pictures(
@@ -80,17 +111,29 @@ def write_pictures(
     """Write every view as the PNG `place(camera, frame)`, seen through the lens of its camera in `targets`."""
     _note_lenses(capture, targets, export)
     views = [(name, j) for name in targets for j in range(capture.frame_count) if (name, j) in capture.images]
+    content = with_alpha if alpha else over(export.background)
     lens = _Lenses(capture, targets)
     for done, (name, frame) in enumerate(views):
         export.show(done, len(views))
         path = place(name, frame)
         if not path.is_file():
-            _write_png(path, lens.picture(name, frame, None if alpha else export.background))
+            _write_png(path, lens.picture(name, frame, content))
     export.show(len(views), len(views))
 
 
-def write_videos(capture: Capture, targets: Mapping[str, Camera], places: Mapping[str, Path], export: Export) -> None:
-    """Write one H.264 video per camera, seen through its lens in `targets`; every camera must have all frames."""
+def write_videos(
+    capture: Capture,
+    targets: Mapping[str, Camera],
+    places: Mapping[str, Path],
+    export: Export,
+    content: Content | None = None,
+    unseen: int = 0,
+) -> None:
+    """Write one H.264 video per camera, seen through its lens in `targets`; every camera must have all frames.
+
+    `content` is what is shown, without it the pictures over the export's background; what a lens did not see becomes
+    the gray `unseen`.
+    """
     _note_lenses(capture, targets, export)
     lacking = [(name, j) for j in range(capture.frame_count) for name in targets if (name, j) not in capture.images]
     if lacking:
@@ -104,7 +147,7 @@ def write_videos(capture: Capture, targets: Mapping[str, Camera], places: Mappin
     def pictures(start: int, name: str) -> Iterator[Picture]:
         for frame in range(capture.frame_count):
             export.show(start + frame, total)
-            yield lens.picture(name, frame, export.background)
+            yield lens.picture(name, frame, content or over(export.background), unseen)
 
     for index, name in enumerate(targets):
         if not places[name].is_file():
@@ -145,15 +188,12 @@ class _Lenses:
         self._name = ""
         self._map: LensMap | None = None
 
-    def picture(self, name: str, frame: int, background: tuple[float, float, float] | None) -> Picture:
-        if background is None and (name, frame) in self._capture.masks:
-            picture = self._capture.rgba(name, frame)
-        else:
-            picture = self._capture.image(name, frame, background)
+    def picture(self, name: str, frame: int, content: Content, unseen: int = 0) -> Picture:
+        picture = content(self._capture, name, frame)
         if self._name != name:
             source, target = self._capture.cameras[name], self._targets[name]
             self._name, self._map = name, None if same_lens(source, target) else lens_map(source, target)
-        return picture if self._map is None else self._map.apply(picture)
+        return picture if self._map is None else self._map.apply(picture, unseen)
 
 
 def _note_lenses(capture: Capture, targets: Mapping[str, Camera], export: Export) -> None:

@@ -17,7 +17,7 @@ from ..camera import Camera
 from ..errors import HoloreelError
 from ..files import MAX_JSON_BYTES, finite
 from .capture import Capture
-from .export import Export, held_out_first, write_text, write_videos
+from .export import Export, numbered, write_text, write_videos
 from .options import CaptureOptions
 from .rotations import matrix_from_vector, vector_from_matrix
 from .video_set import check_pairs, find_videos, video_capture
@@ -116,13 +116,18 @@ def target(camera: Camera) -> Camera:
     return replace(camera, model="OPENCV_FISHEYE", distortion=(0.0,) * 4, fx=focal, fy=focal)
 
 
+def names(capture: Capture) -> dict[str, str]:
+    """Return what each camera is called: camera_0001 is the held-out one."""
+    return numbered(capture, [f"camera_{i:04d}" for i in range(1, len(capture.cameras) + 1)], (HELD_OUT,))
+
+
 def write(capture: Capture, path: Path, export: Export) -> None:
     """Write camera_0001.mp4 (the held-out camera), camera_0002.mp4, … and models.json into `path`."""
-    names = {name: f"camera_{number:04d}" for number, name in enumerate(held_out_first(capture), start=1)}
+    files = names(capture)
     lenses = export.lenses(capture)
-    targets = {name: target(lenses[name]) for name in names}
-    write_videos(capture, targets, {name: path / f"{file}.mp4" for name, file in names.items()}, export)
-    entries = [_entry(names[name], camera) for name, camera in targets.items()]
+    targets = {name: target(lenses[name]) for name in files}
+    write_videos(capture, targets, {name: path / f"{file}.mp4" for name, file in files.items()}, export)
+    entries = [_entry(files[name], camera) for name, camera in targets.items()]
     write_text(path / FILE_NAME, json.dumps(entries, indent=1, allow_nan=False) + "\n")
 
 

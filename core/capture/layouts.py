@@ -2,7 +2,7 @@
 """The layouts of captures on disk, as a table; reading one, whichever it is."""
 
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -27,7 +27,7 @@ class Layout:
     scale: int = 1  # by which the protocol divides the size of the pictures
     held_out: tuple[str, ...] | None = ()  # cameras to test on; the first where none has these names; None: files say
     holds_seeds: bool = False
-    keeps_names: bool = False  # of cameras; the others number them, held-out ones in the places of `held_out`
+    names: Callable[[Capture], dict[str, str]] = file_names  # what each camera is called once it is written
 
 
 def _read_nerfstudio(path: Path, options: CaptureOptions) -> Capture:
@@ -64,15 +64,15 @@ LAYOUTS = {
         _write_nerfstudio,
         held_out=None,
         holds_seeds=True,
-        keeps_names=True,
     ),
-    "n3v": Layout("cam??.mp4 and poses_bounds.npy", n3v.matches, n3v.read, n3v.write, scale=2),
+    "n3v": Layout("cam??.mp4 and poses_bounds.npy", n3v.matches, n3v.read, n3v.write, scale=2, names=n3v.names),
     "technicolor": Layout(
         "SCENE_undist_FRAME_CAMERA.png and cameras_parameters.txt",
         technicolor.matches,
         technicolor.read,
         technicolor.write,
         held_out=(technicolor.HELD_OUT,),
+        names=technicolor.names,
     ),
     "immersive": Layout(
         "models.json and a video per camera",
@@ -81,6 +81,7 @@ LAYOUTS = {
         immersive.write,
         scale=2,
         held_out=(immersive.HELD_OUT,),
+        names=immersive.names,
     ),
     "colmap": Layout(
         "images and sparse/0, or folders colmap_FRAME",
@@ -88,9 +89,8 @@ LAYOUTS = {
         colmap.read,
         colmap.write,
         holds_seeds=True,
-        keeps_names=True,
     ),
-    "videos": Layout("a video per camera", videos.matches, videos.read, videos.write, keeps_names=True),
+    "videos": Layout("a video per camera", videos.matches, videos.read, videos.write),
 }
 
 
@@ -170,11 +170,16 @@ def _splits(capture: Capture, options: CaptureOptions, layout: Layout) -> dict[s
             )
     elif layout.held_out is None:
         return capture.splits
-    elif len(capture.cameras) == 1:
-        held_out = []
     else:
-        held_out = [name for name in layout.held_out if name in capture.cameras] or [next(iter(capture.cameras))]
+        held_out = default_held_out(layout, list(capture.cameras))
     return {name: "test" if name in held_out else "train" for name in capture.cameras}
+
+
+def default_held_out(layout: Layout, names: Sequence[str]) -> list[str]:
+    """Return which of the cameras `names`, in order, a reader of the layout holds out where nobody says."""
+    if len(names) == 1:
+        return []
+    return [name for name in layout.held_out or () if name in names] or [names[0]]
 
 
 def _scaled(capture: Capture, name: str, scale: int) -> Any:

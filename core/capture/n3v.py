@@ -18,7 +18,7 @@ from ..camera import Camera, invert_rigid, rigid
 from ..errors import HoloreelError
 from ..files import atomic_path
 from .capture import Capture
-from .export import Export, held_out_first, pinhole, write_videos
+from .export import Export, numbered, pinhole, write_videos
 from .options import CaptureOptions
 from .video_set import find_videos, probe_all, video_capture
 
@@ -92,13 +92,19 @@ def target(camera: Camera) -> Camera:
     return replace(pinhole(camera), fy=camera.fx, cx=camera.width / 2, cy=camera.height / 2)
 
 
+def names(capture: Capture) -> dict[str, str]:
+    """Return what each camera is called: cam00 is the held-out one."""
+    count = len(capture.cameras)
+    digits = max(2, len(str(count - 1)))
+    return numbered(capture, [f"cam{i:0{digits}d}" for i in range(count)], ())
+
+
 def write(capture: Capture, path: Path, export: Export) -> None:
     """Write cam00.mp4 (the held-out camera), cam01.mp4, … and poses_bounds.npy into `path`."""
-    order = held_out_first(capture)
-    digits = max(2, len(str(len(order) - 1)))
+    files = names(capture)
     lenses = export.lenses(capture)
-    targets = {name: target(lenses[name]) for name in order}
-    write_videos(capture, targets, {name: path / f"cam{i:0{digits}d}.mp4" for i, name in enumerate(order)}, export)
+    targets = {name: target(lenses[name]) for name in files}
+    write_videos(capture, targets, {name: path / f"{file}.mp4" for name, file in files.items()}, export)
     rows = np.stack([row_of(camera, *_bounds(capture, camera)) for camera in targets.values()])
     with atomic_path(path / FILE_NAME) as temporary:
         np.save(temporary, rows)

@@ -8,12 +8,12 @@ from .media import VideoFrame
 
 
 def check_pictures(capture: Capture) -> None:
-    """Raise `HoloreelError` naming the first picture that is missing, damaged, or not of its camera's size.
+    """Raise `HoloreelError` naming the first picture or mask that is missing, damaged, or not of its camera's size.
 
-    Pictures may be a whole number of times larger than their camera says, as `Capture.image` has it.
+    They may be a whole number of times larger than their camera says, as `Capture.image` has it.
     """
     capture.check_files()
-    for (name, _), media in capture.images.items():
+    for (name, _), media in (*capture.images.items(), *capture.masks.items()):
         if isinstance(media, VideoFrame):
             continue
         camera, (width, height) = capture.cameras[name], picture_size(media)

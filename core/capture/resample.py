@@ -23,14 +23,14 @@ class LensMap:
     weight: NDArray[np.float32]  # (height, width, 2): how far toward the right and the lower ones
     seen: NDArray[np.bool_]  # (height, width): whether the source saw it at all
 
-    def apply(self, picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """Resample (H, W, C) bilinearly; black where the source saw nothing."""
+    def apply(self, picture: NDArray[np.uint8], unseen: int = 0) -> NDArray[np.uint8]:
+        """Resample (H, W, C) bilinearly; `unseen` in all channels where the source saw nothing."""
         column, row = self.corner[..., 0], self.corner[..., 1]
         right, down = self.weight[..., 0, None], self.weight[..., 1, None]
         upper = picture[row, column] * (1 - right) + picture[row, column + 1] * right
         lower = picture[row + 1, column] * (1 - right) + picture[row + 1, column + 1] * right
         mixed = upper * (1 - down) + lower * down
-        return np.where(self.seen[..., None], np.rint(mixed), 0).astype(np.uint8)
+        return np.where(self.seen[..., None], np.rint(mixed), unseen).astype(np.uint8)
 
 
 def lens_map(source: Camera, target: Camera) -> LensMap:

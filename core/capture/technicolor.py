@@ -12,7 +12,7 @@ from pathlib import Path
 from ..camera import Camera
 from ..errors import HoloreelError
 from .capture import MAX_FRAMES, Capture, View
-from .export import Export, held_out_first, pinhole, write_pictures, write_text
+from .export import Export, numbered, pinhole, write_pictures, write_text
 from .images import picture_size
 from .media import Media
 from .options import CaptureOptions
@@ -124,11 +124,14 @@ def _camera(file: Path, index: int, row: list[float], size: tuple[int, int], nam
         raise HoloreelError(f"{file}: row {index}: {str(error).rstrip('.')}; fetch it again.") from error
 
 
+def names(capture: Capture) -> dict[str, str]:
+    """Return what each camera is called: the held-out one is number 10 where there are more than 10, else 0."""
+    return numbered(capture, [f"cam{i:02d}" for i in range(len(capture.cameras))], (HELD_OUT,))
+
+
 def write(capture: Capture, path: Path, export: Export) -> None:
-    """Write PATH's name as the scene's; the held-out camera becomes number 10 where there are more than 10, else 0."""
-    order = held_out_first(capture)
-    if len(order) > 10:
-        order.insert(10, order.pop(0))
+    """Write the files of a scene that is called as `path` is."""
+    order = list(names(capture))
     lenses = export.lenses(capture)
     targets = {name: pinhole(lenses[name]) for name in order}
     numbers = {name: number for number, name in enumerate(order)}

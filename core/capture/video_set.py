@@ -68,19 +68,26 @@ def video_capture(
     videos: Mapping[str, Path],
     options: CaptureOptions,
     facts: Mapping[str, VideoFacts] | None = None,
+    masks: Mapping[str, Path] | None = None,
 ) -> Capture:
     """Return the capture of `videos` that start together, frame k of each being frame k of the capture.
 
-    Cameras must have the sizes of their videos. Raises `HoloreelError` where sizes, frame counts or rates disagree.
+    Cameras must have the sizes of their videos. `masks` are videos of all cameras or none, of the same size or a whole
+    number of times larger. Raises `HoloreelError` where sizes, frame counts or rates disagree.
     """
-    facts = facts or probe_all(videos)
+    facts, masks = facts or probe_all(videos), masks or {}
     check_sizes(source, cameras, facts)
-    chosen = options.common_frames(source, {videos[name].name: found.frames for name, found in facts.items()})
+    files = {videos[name]: found for name, found in facts.items()} | {masks[n]: f for n, f in probe_all(masks).items()}
+    for name, mask in masks.items():
+        check_mask_size(mask, files[mask], facts[name])
+    counts = {_said(file, source.parent): found.frames for file, found in files.items()}
+    chosen = options.common_frames(source, counts)
     if len(chosen) > MAX_FRAMES:
         raise HoloreelError(f"{source}: {len(chosen)} frames are more than {MAX_FRAMES}; take a part by --frames.")
     return Capture(
         cameras={name: replace(camera, name=name) for name, camera in cameras.items()},
         images={(name, j): VideoFrame(videos[name], k) for j, k in enumerate(chosen) for name in cameras},
+        masks={(name, j): VideoFrame(mask, k) for j, k in enumerate(chosen) for name, mask in masks.items()},
         frame_count=len(chosen),
         fps=common_rate(source, facts, options),
         frame_start=chosen.start,
@@ -97,6 +104,21 @@ def check_sizes(source: Path, cameras: Mapping[str, Camera], facts: Mapping[str,
                 f"{source}: {name} was calibrated at {camera.width}x{camera.height}, its video is "
                 f"{found.width}x{found.height}; give the calibration of these videos."
             )
+
+
+def check_mask_size(mask: Path, found: VideoFacts, video: VideoFacts) -> None:
+    """Raise `HoloreelError` unless a mask's video is as large as its camera's, or a whole number of times as large."""
+    times = max(found.width // video.width, 1)
+    if (found.width, found.height) != (times * video.width, times * video.height):
+        raise HoloreelError(
+            f"{mask}: the mask is {found.width}x{found.height}, its video {video.width}x{video.height}; "
+            "make the masks from these videos."
+        )
+
+
+def _said(file: Path, folder: Path) -> str:
+    """How a file is called in a message about what lies in `folder`."""
+    return file.relative_to(folder).as_posix() if file.is_relative_to(folder) else file.name
 
 
 def common_rate(source: Path, facts: Mapping[str, VideoFacts], options: CaptureOptions) -> float:
