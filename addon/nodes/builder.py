@@ -6,7 +6,7 @@ calculating with them adds nodes: `position + velocity * dt` is two of them. Num
 """
 
 from collections import defaultdict
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, Self, TypeAlias
 
 import bpy
@@ -18,6 +18,10 @@ SOCKETS = {
     "Float": "NodeSocketFloat",
     "Integer": "NodeSocketInt",
     "Menu": "NodeSocketMenu",
+    "Boolean": "NodeSocketBool",
+    "Object": "NodeSocketObject",
+    "Vector": "NodeSocketVector",
+    "Image": "NodeSocketImage",
 }
 
 
@@ -37,8 +41,26 @@ class Menu(Value):
     """The choice of a menu."""
 
 
+class Object(Value):
+    """One of Blender's objects, or none."""
+
+
+class Image(Value):
+    """An image data-block, which may be a movie."""
+
+
 class Boolean(Value):
     """True or false."""
+
+    def _logic(self, operation: str, *operands: "Boolean") -> "Boolean":
+        node = self.tree.node("FunctionNodeBooleanMath", dict(enumerate(operands)), operation=operation)
+        return Boolean(self.tree, node.outputs[0])
+
+    def __and__(self, other: "Boolean") -> "Boolean":
+        return self._logic("AND", self, other)
+
+    def __invert__(self) -> "Boolean":
+        return self._logic("NOT", self)
 
 
 class Rotation(Value):
@@ -52,6 +74,31 @@ class Rotation(Value):
     def inverted(self) -> "Rotation":
         """Return the opposite rotation."""
         return Rotation(self.tree, self.tree.node("FunctionNodeInvertRotation", {0: self}).outputs[0])
+
+
+class Matrix(Value):
+    """Four by four numbers; the first three columns are the images of the axes, the last that of the origin."""
+
+    def columns(self) -> "list[Vector]":
+        """Return the first three numbers of each of the four columns."""
+        entries = self.tree.node("FunctionNodeSeparateMatrix", {0: self}).outputs
+        return [
+            self.tree.vector(*(Float(self.tree, entries[f"Column {column} Row {row}"]) for row in (1, 2, 3)))
+            for column in (1, 2, 3, 4)
+        ]
+
+    def transposed(self) -> "Matrix":
+        """Return rows as columns."""
+        return Matrix(self.tree, self.tree.node("FunctionNodeTransposeMatrix", {0: self}).outputs[0])
+
+    def inverted(self) -> "Matrix":
+        """Return the inverse; the identity if there is none."""
+        return Matrix(self.tree, self.tree.node("FunctionNodeInvertMatrix", {0: self}).outputs[0])
+
+    def transform(self, point: "VectorLike") -> "Vector":
+        """Return a point transformed by this."""
+        node = self.tree.node("FunctionNodeTransformPoint", {"Vector": point, "Transform": self})
+        return Vector(self.tree, node.outputs[0])
 
 
 class Color(Value):
@@ -126,9 +173,17 @@ class Float(Value):
         """Return the remainder with the sign of `period`; 0 where `period` is 0."""
         return self._math("FLOORED_MODULO", self, period)
 
+    def floor(self) -> "Float":
+        """Return the largest whole number that is not above this."""
+        return self._math("FLOOR", self)
+
+    def absolute(self) -> "Float":
+        """Return this without its sign."""
+        return self._math("ABSOLUTE", self)
+
     def is_zero(self) -> "Float":
         """Return 1 where this is exactly 0, else 0."""
-        return 1.0 - self._math("GREATER_THAN", self._math("ABSOLUTE", self), 0.0)
+        return 1.0 - self.absolute().above(0.0)
 
     def above(self, limit: "FloatLike") -> "Float":
         """Return 1 where this is above `limit`, else 0 (works in materials too)."""
@@ -163,6 +218,30 @@ class Vector(Value):
         """Return the scalar product."""
         return Float(self.tree, self._math("DOT_PRODUCT", self, other).outputs["Value"])
 
+    def cross(self, other: "VectorLike") -> "Vector":
+        """Return the vector product."""
+        return Vector(self.tree, self._math("CROSS_PRODUCT", self, other).outputs[0])
+
+    def length(self) -> Float:
+        """Return the length."""
+        return Float(self.tree, self._math("LENGTH", self).outputs["Value"])
+
+    def normalized(self) -> "Vector":
+        """Return the direction, of length 1; zero stays zero."""
+        return Vector(self.tree, self._math("NORMALIZE", self).outputs[0])
+
+    def at_least(self, limit: "VectorLike") -> "Vector":
+        """Return the larger of the two, axis by axis."""
+        return Vector(self.tree, self._math("MAXIMUM", self, limit).outputs[0])
+
+    def sin(self) -> "Vector":
+        """Return the sine of each axis."""
+        return Vector(self.tree, self._math("SINE", self).outputs[0])
+
+    def cos(self) -> "Vector":
+        """Return the cosine of each axis."""
+        return Vector(self.tree, self._math("COSINE", self).outputs[0])
+
     def axes(self) -> tuple[Float, Float, Float]:
         """Return x, y and z."""
         x, y, z = self.tree.node("ShaderNodeSeparateXYZ", {0: self}).outputs
@@ -177,7 +256,7 @@ ATTRIBUTES: dict[str, type[Value]] = {
     "FLOAT_VECTOR": Vector,
     "FLOAT_COLOR": Color,
     "QUATERNION": Rotation,
-    "FLOAT4X4": Value,
+    "FLOAT4X4": Matrix,
 }
 
 
@@ -257,6 +336,18 @@ class Tree:
         """Declare a whole number."""
         return self.float_input(name, tooltip, default, low, panel=panel, kind="Integer")
 
+    def boolean_input(self, name: str, tooltip: str, default: bool, panel: str | None = None) -> Boolean:
+        """Declare a check box."""
+        item = self._socket("INPUT", "Boolean", name, tooltip, panel)
+        item.default_value = default
+        item.force_non_field = True
+        return Boolean(self, self._input_socket(name))
+
+    def object_input(self, name: str, tooltip: str, panel: str | None = None) -> Object:
+        """Declare an object."""
+        self._socket("INPUT", "Object", name, tooltip, panel)
+        return Object(self, self._input_socket(name))
+
     def menu_input(self, name: str, tooltip: str, panel: str | None = None) -> Menu:
         """Declare a menu; its items come from the `switch` that it is linked to. See `set_menu_default`."""
         self._socket("INPUT", "Menu", name, tooltip, panel)
@@ -267,6 +358,25 @@ class Tree:
         for socket in self.tree.interface.items_tree:
             if socket.item_type == "SOCKET" and socket.in_out == "INPUT" and socket.name == name:
                 socket.default_value = item
+
+    def vector_input(
+        self,
+        name: str,
+        tooltip: str,
+        default: tuple[float, float, float] = (0.0, 0.0, 0.0),
+        panel: str | None = None,
+        is_field: bool = False,
+    ) -> Vector:
+        """Declare three numbers, the same for all points unless `is_field`."""
+        item = self._socket("INPUT", "Vector", name, tooltip, panel)
+        item.default_value = default
+        item.force_non_field = not is_field
+        return Vector(self, self._input_socket(name))
+
+    def image_input(self, name: str, tooltip: str, panel: str | None = None) -> Image:
+        """Declare an image."""
+        self._socket("INPUT", "Image", name, tooltip, panel)
+        return Image(self, self._input_socket(name))
 
     def output(self, name: str, value: Value, tooltip: str = "") -> None:
         """Declare an output of the group and connect it."""
@@ -289,6 +399,18 @@ class Tree:
         """Return the field of positions."""
         return Vector(self, self.node("GeometryNodeInputPosition").outputs[0])
 
+    def vector(self, x: FloatLike, y: FloatLike, z: FloatLike) -> Vector:
+        """Return the vector of three numbers."""
+        return Vector(self, self.node("ShaderNodeCombineXYZ", {0: x, 1: y, 2: z}).outputs[0])
+
+    def matrix(self, columns: Sequence[Vector]) -> Matrix:
+        """Return the transform with four columns of three numbers; the last is where it moves the origin."""
+        node = self.node("FunctionNodeCombineMatrix")
+        for column, vector in enumerate(columns, start=1):
+            for row, axis in enumerate(vector.axes(), start=1):
+                self.connect(node.inputs[f"Column {column} Row {row}"], axis)
+        return Matrix(self, node.outputs[0])
+
     def quaternion(self, w: FloatLike, x: FloatLike, y: FloatLike, z: FloatLike) -> Rotation:
         """Return the rotation of a quaternion, which is normalized first."""
         node = self.node("FunctionNodeQuaternionToRotation", {"W": w, "X": x, "Y": y, "Z": z})
@@ -310,6 +432,13 @@ class Tree:
             self.connect(node.inputs[name], value)
         value_type = type(next(iter(choices.values()))[1])
         return value_type(self, node.outputs[0])
+
+    def choose(self, condition: Boolean, chosen: Value, otherwise: Value, kind: str) -> Any:
+        """Return `chosen` where the condition is true, else `otherwise`; `kind` is the socket type."""
+        node = self.node("GeometryNodeSwitch", input_type=kind)
+        for name, value in (("Switch", condition), ("False", otherwise), ("True", chosen)):
+            self.connect(node.inputs[name], value)
+        return type(chosen)(self, node.outputs[0])
 
     # --- Geometry
 

@@ -10,7 +10,7 @@ from .builder import Tree
 TAG = "holoreel"  # custom property that holds "name version"
 
 
-def find(collection: bpy.types.bpy_prop_collection, name: str, version: int) -> bpy.types.ID | None:
+def find(collection: bpy.types.bpy_prop_collection, name: str, version: int | str) -> bpy.types.ID | None:
     """Return the local data-block tagged `name version`, whatever it is called now."""
     for block in collection:
         if block.library is None and block.get(TAG) == f"{name} {version}":
@@ -23,7 +23,7 @@ def is_tagged(block: bpy.types.ID, name: str) -> bool:
     return str(block.get(TAG, "")).rpartition(" ")[0] == name
 
 
-def tag(block: bpy.types.ID, name: str, version: int) -> None:
+def tag(block: bpy.types.ID, name: str, version: int | str) -> None:
     """Mark a data-block so that `find` finds it."""
     block[TAG] = f"{name} {version}"
 
@@ -38,18 +38,26 @@ def node_group(
 
     def decorate(build: Callable[[Tree], None]) -> Callable[[], bpy.types.NodeTree]:
         def ensure() -> bpy.types.NodeTree:
-            group = find(bpy.data.node_groups, name, version)
-            if group is None:
-                group = bpy.data.node_groups.new(name, "GeometryNodeTree")
-                group.description = tooltip
-                tree = Tree(group)
-                build(tree)
-                tree.arrange()
-                tag(group, name, version)
-            return group
+            return ensure_group(name, version, tooltip, build)
 
         ensure.__name__ = build.__name__
         ensure.__doc__ = build.__doc__
         return ensure
 
     return decorate
+
+
+def ensure_group(name: str, version: int | str, tooltip: str, build: Callable[[Tree], None]) -> bpy.types.NodeTree:
+    """Return the group `name version`, which `build` fills if it is not there yet.
+
+    A group that differs from reel to reel has a digest of what it was built from in its version.
+    """
+    group = find(bpy.data.node_groups, name, version)
+    if group is None:
+        group = bpy.data.node_groups.new(name, "GeometryNodeTree")
+        group.description = tooltip
+        tree = Tree(group)
+        build(tree)
+        tree.arrange()
+        tag(group, name, version)
+    return group
