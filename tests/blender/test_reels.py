@@ -292,3 +292,11 @@ def test_real_models_evaluate_as_numpy_does(name: str, shared_data: Callable[[st
         assert abs(len(alive) - len(shown["position"])) <= 1  # 1/255 itself may round either way
         if len(alive) == len(shown["position"]):
             assert_same(shown, truth)
+
+
+def test_mapping_reads_back_as_it_was_set(random_model: Model) -> None:
+    timeline = Timeline(40, start=3.5, speed=-0.75, offset=0.25, first=2, last=33, repeat=PING_PONG)
+    reel = reels.create_reel_object(bpy.context, "reel", random_model(5), timeline)
+    assert reels.timeline_of(reel) == timeline
+    with pytest.raises(HoloreelError, match="no reel"):
+        reels.timeline_of(bpy.data.objects.new("Empty", None))
