@@ -3,8 +3,9 @@
 
 from ...core.gaussians.model import OPACITY_MIN
 from ..materials import QUAD_ATTRIBUTE, point_material, splat_material
-from .builder import Float, Geometry, Rotation, Tree, Value, Vector
+from .builder import Boolean, Float, Geometry, Object, Tree
 from .library import node_group
+from .view import View, view_camera
 
 LOW_PASS_PX2, NEAR, JACOBIAN_CLAMP = 0.3, 0.2, 1.3  # the rules the models were trained under
 QUAD_MARGIN = 1.01  # a little larger than where alpha reaches 1/255, so that no edge shows
@@ -29,7 +30,7 @@ def points_inputs(tree: Tree) -> dict[str, Float]:
     }
 
 
-def splats_inputs(tree: Tree) -> dict[str, Float]:
+def splats_inputs(tree: Tree) -> dict[str, Float | Boolean]:
     """Declare the inputs of the look Splats; return them by name."""
     panel = SPLATS_PANEL
     pixels = "of the rendered picture in pixels; follows the scene's resolution by itself"
@@ -41,6 +42,12 @@ def splats_inputs(tree: Tree) -> dict[str, Float]:
         ),
         "Near": tree.float_input(
             "Near", "Splats nearer to the camera are left out, in the reel's own units", NEAR, 0.0, panel=panel
+        ),
+        "Follow View": tree.boolean_input(
+            "Follow View",
+            "In a 3D viewport that looks through no camera, face its own view; sorting takes time while it turns",
+            True,
+            panel,
         ),
     }
 
@@ -78,28 +85,8 @@ def points(tree: Tree) -> None:
     tree.output("Geometry", cloud, "Points")
 
 
-class _Camera:
-    """The active camera as fields, seen from the object: axes, place, and what its projection does."""
-
-    def __init__(self, tree: Tree, width_px: Float, height_px: Float) -> None:
-        active = Value(tree, tree.node("GeometryNodeInputActiveCamera").outputs[0])
-        pose = tree.node("GeometryNodeObjectInfo", {"Object": active}, transform_space="RELATIVE")
-        info = tree.node("GeometryNodeCameraInfo", {"Camera": active})
-        self.location = Vector(tree, pose.outputs["Location"])
-        rotation = Rotation(tree, pose.outputs["Rotation"])
-        self.right, self.up, self.back = (rotation.rotate(axis) for axis in ((1, 0, 0), (0, 1, 0), (0, 0, 1)))
-        matrix = Value(tree, info.outputs["Projection Matrix"])
-        entries = tree.node("FunctionNodeSeparateMatrix", {0: matrix}).outputs
-        # Half the tangent of the field of view, and the size of a pixel at depth 1 (anywhere, if orthographic).
-        self.tangent_x = 1.0 / Float(tree, entries["Column 1 Row 1"])
-        self.tangent_y = 1.0 / Float(tree, entries["Column 2 Row 2"])
-        self.pixel_x = self.tangent_x * 2.0 / width_px
-        self.pixel_y = self.tangent_y * 2.0 / height_px
-        self.orthographic = Float(tree, info.outputs["Is Orthographic"])
-
-
 @node_group(
-    "Holoreel Splats", 1, "Show evaluated Gaussians as the splats they were trained as, seen by the active camera"
+    "Holoreel Splats", 2, "Show evaluated Gaussians as the splats they were trained as, seen by the active camera"
 )
 def splats(tree: Tree) -> None:
     """One quad per Gaussian, parallel to the image plane (EWA splatting), far ones first.
@@ -107,31 +94,32 @@ def splats(tree: Tree) -> None:
     In the plane at the center's depth z, the projected Gaussian has the covariance Σ' = A Aᵀ + low-pass, where row 0 of
     A is S Rᵀ (right − x/z · forward), row 1 the same with up and y/z: the Jacobian of the projection times z. A quad
     whose axes are the columns of the Cholesky factor of Σ', with exp(−r²/2) on it, is what the rasterizer draws, and
-    sorting by z is its order.
+    sorting by z is its order. Lengths are the world's, so that the object may be scaled and sheared.
     """
     cloud = tree.geometry_input()
     inputs = splats_inputs(tree)
-    camera = _Camera(tree, inputs["Render Width"], inputs["Render Height"])
+    camera = tree.group(view_camera(), {"Follow View": inputs["Follow View"]}).outputs["Camera"]
+    view = View(tree, Object(tree, camera), inputs["Render Width"], inputs["Render Height"])
 
     center = tree.position()
-    offset = center - camera.location
-    depth = -offset.dot(camera.back)
-    cloud = tree.delete_points(cloud, depth.below(inputs["Near"]))
+    offset = center - view.location
+    depth = -offset.dot(view.behind)
+    cloud = tree.delete_points(cloud, depth.below(inputs["Near"] * view.scale))
     cloud = tree.geometry("GeometryNodeSortElements", {"Geometry": cloud, "Sort Weight": -depth}, domain="POINT")
 
-    perspective = 1.0 - camera.orthographic
-    distance = depth * perspective + camera.orthographic
+    perspective = 1.0 - view.orthographic
+    distance = depth * perspective + view.orthographic
     slopes = [
         _clamped(offset.dot(axis) / depth, tangent * JACOBIAN_CLAMP) * perspective
-        for axis, tangent in ((camera.right, camera.tangent_x), (camera.up, camera.tangent_y))
+        for axis, tangent in ((view.across, view.tangent_x), (view.above, view.tangent_y))
     ]
     unrotate = tree.attribute("rotation", "QUATERNION").inverted()
     scale = tree.attribute("scale", "FLOAT_VECTOR")
     rows = [
-        unrotate.rotate(axis + camera.back * slope) * scale
-        for axis, slope in zip((camera.right, camera.up), slopes, strict=True)
+        unrotate.rotate(axis + view.behind * slope) * scale
+        for axis, slope in zip((view.across, view.above), slopes, strict=True)
     ]
-    blur_x, blur_y = (_square(distance * pixel) * inputs["Low Pass"] for pixel in (camera.pixel_x, camera.pixel_y))
+    blur_x, blur_y = (_square(distance * pixel) * inputs["Low Pass"] for pixel in (view.pixel_x, view.pixel_y))
     xx, xy, yy = rows[0].dot(rows[0]) + blur_x, rows[0].dot(rows[1]), rows[1].dot(rows[1]) + blur_y
     l00 = xx.sqrt()
     l10 = xy / l00
@@ -139,8 +127,8 @@ def splats(tree: Tree) -> None:
 
     # As far as alpha exceeds 1/255: d² = 2 ln(255 o).
     reach = ((tree.attribute("opacity", "FLOAT") * (1.0 / OPACITY_MIN)).log() * 2.0).sqrt()
-    columns = [camera.right * (l00 * reach) + camera.up * (l10 * reach), camera.up * (l11 * reach), camera.back, center]
-    cloud = tree.store(cloud, "splat_transform", _matrix(tree, columns), "FLOAT4X4")
+    columns = [view.right * (l00 * reach) + view.up * (l10 * reach), view.up * (l11 * reach), view.back, center]
+    cloud = tree.store(cloud, "splat_transform", tree.matrix(columns), "FLOAT4X4")
     tree.output("Geometry", _quads(tree, cloud), "Splats")
 
 
@@ -150,14 +138,6 @@ def _square(value: Float) -> Float:
 
 def _clamped(value: Float, limit: Float) -> Float:
     return value.at_most(limit).at_least(-limit)
-
-
-def _matrix(tree: Tree, columns: list[Vector]) -> Value:
-    node = tree.node("FunctionNodeCombineMatrix")
-    for column, vector in enumerate(columns, start=1):
-        for row, axis in enumerate(vector.axes(), start=1):
-            tree.connect(node.inputs[f"Column {column} Row {row}"], axis)
-    return Value(tree, node.outputs[0])
 
 
 def _quads(tree: Tree, cloud: Geometry) -> Geometry:

@@ -29,7 +29,7 @@ LOOK_PANEL = "Look"
 NAME = "Holoreel Reel"
 
 
-@node_group(NAME, 1, "Play Spacetime Gaussians on the timeline")
+@node_group(NAME, 2, "Play Spacetime Gaussians on the timeline")
 def reel(tree: Tree) -> None:
     """Takes the points of `attributes.TABLE`."""
     cloud = tree.geometry_input()

@@ -34,19 +34,31 @@ def rotations(quats: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.array(rows).transpose(2, 0, 1)
 
 
-def splat(gaussians: EvaluatedGaussians, view: View, stop: float = STOP) -> NDArray[np.float64]:
-    """Return premultiplied RGBA (H, W, 4) of the visible Gaussians over nothing."""
+def place(
+    gaussians: EvaluatedGaussians, world: NDArray[np.float64] | None
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return centers (N, 3) and square roots of covariances (N, 3, 3) in the world that an object's matrix leads to."""
+    world = np.eye(4) if world is None else world
+    spreads = rotations(gaussians.quats.astype(np.float64)) * gaussians.scales.astype(np.float64)[:, None, :]
+    return gaussians.means.astype(np.float64) @ world[:3, :3].T + world[:3, 3], world[:3, :3] @ spreads
+
+
+def splat(
+    gaussians: EvaluatedGaussians, view: View, stop: float = STOP, world: NDArray[np.float64] | None = None
+) -> NDArray[np.float64]:
+    """Return premultiplied RGBA (H, W, 4) of the visible Gaussians over nothing; `world` may scale and shear them."""
     alive = gaussians.take(gaussians.alive)
     rotation, translation = view.world_to_camera[:3, :3], view.world_to_camera[:3, 3]
-    places = alive.means.astype(np.float64) @ rotation.T + translation
-    spreads = rotations(alive.quats.astype(np.float64)) * alive.scales.astype(np.float64)[:, None, :]
+    centers, spreads = place(alive, world)
+    places = centers @ rotation.T + translation
+    near = NEAR * (1.0 if world is None else np.cbrt(np.abs(np.linalg.det(world[:3, :3]))))
     columns, rows = np.meshgrid(np.arange(view.width) + 0.5, np.arange(view.height) + 0.5)
     color, through = np.zeros((view.height, view.width, 3)), np.ones((view.height, view.width))
     stopped = np.zeros_like(through, dtype=bool)
     limit_x, limit_y = CLAMP * 0.5 * view.width / view.fx, CLAMP * 0.5 * view.height / view.fy
     for index in np.argsort(places[:, 2], kind="stable"):
         x, y, z = places[index]
-        if z < NEAR:
+        if z < near:
             continue
         slope_x, slope_y = np.clip(x / z, -limit_x, limit_x), np.clip(y / z, -limit_y, limit_y)
         jacobian = np.array([[view.fx / z, 0, -view.fx * slope_x / z], [0, view.fy / z, -view.fy * slope_y / z]])

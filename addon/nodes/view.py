@@ -1,0 +1,65 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Who looks: the active camera, or the 3D viewport's own view, as seen from the object that a modifier belongs to."""
+
+import bpy
+
+from .builder import Boolean, Float, Matrix, Object, Tree, Vector
+from .library import node_group
+
+VIEW_GROUP, VIEW_VERSION = "Holoreel View", 1
+SWITCH_NODE, SCALE_NODE = "Viewport Camera", "Viewport Camera Scale"  # both take the object that the add-on moves
+
+
+@node_group(VIEW_GROUP, VIEW_VERSION, "The camera that splats face: the active one, or the viewport's own view")
+def view_camera(tree: Tree) -> None:
+    """The add-on moves the viewport's camera (`addon.viewport`); its scale is 0 where the active camera counts."""
+    follow = tree.boolean_input("Follow View", "Face the 3D viewport's own view where it looks through no camera", True)
+    switch = tree.node("GeometryNodeSwitch", input_type="OBJECT")
+    switch.name = SWITCH_NODE
+    stands = tree.node("GeometryNodeObjectInfo", transform_space="ORIGINAL")
+    stands.name = SCALE_NODE
+    x, _, _ = Vector(tree, stands.outputs["Scale"]).axes()
+    in_viewport = Boolean(tree, tree.node("GeometryNodeIsViewport").outputs[0])
+    condition = in_viewport & follow & ~x.below(0.5)
+    tree.connect(switch.inputs["Switch"], condition)
+    tree.connect(switch.inputs["False"], Object(tree, tree.node("GeometryNodeInputActiveCamera").outputs[0]))
+    tree.output("Camera", Object(tree, switch.outputs[0]), "The camera to face")
+
+
+class View:
+    """A camera as fields, seen from the object, however either is moved, turned, scaled or sheared.
+
+    Three vectors `right`, `up` and `back` of the object's space are one world unit long along the camera's axes; three
+    covectors `across`, `above` and `behind` measure: their scalar products with an offset from `location` are the
+    world's lengths along those axes. Where the object is moved and turned alone, vectors and covectors are the same.
+    """
+
+    def __init__(self, tree: Tree, camera: Object, width_px: Float, height_px: Float) -> None:
+        from_object = _transform(tree, camera, "RELATIVE")
+        # Blender takes a camera's axes for one unit long, whatever the camera is scaled by.
+        lengths = [axis.length() for axis in _transform(tree, camera, "ORIGINAL").columns()[:3]]
+        *axes, self.location = from_object.columns()
+        self.right, self.up, self.back = (axis * (1.0 / length) for axis, length in zip(axes, lengths, strict=True))
+        rows = from_object.inverted().transposed().columns()[:3]
+        self.across, self.above, self.behind = (row * length for row, length in zip(rows, lengths, strict=True))
+        self.exists = ~lengths[0].below(1e-12)
+        # World units per unit of the object: the geometric mean over the axes.
+        self.scale = self.across.dot(self.above.cross(self.behind)).absolute().power(1 / 3)
+
+        info = tree.node("GeometryNodeCameraInfo", {"Camera": camera})
+        entries = tree.node("FunctionNodeSeparateMatrix", {0: _matrix(tree, info.outputs["Projection Matrix"])}).outputs
+        # Half the tangent of the field of view, and the size of a pixel at depth 1 (anywhere, if orthographic).
+        self.tangent_x = 1.0 / Float(tree, entries["Column 1 Row 1"])
+        self.tangent_y = 1.0 / Float(tree, entries["Column 2 Row 2"])
+        self.pixel_x = self.tangent_x * 2.0 / width_px
+        self.pixel_y = self.tangent_y * 2.0 / height_px
+        self.orthographic = Float(tree, info.outputs["Is Orthographic"])
+
+
+def _transform(tree: Tree, found: Object, space: str) -> Matrix:
+    node = tree.node("GeometryNodeObjectInfo", {"Object": found}, transform_space=space)
+    return _matrix(tree, node.outputs["Transform"])
+
+
+def _matrix(tree: Tree, socket: bpy.types.NodeSocket) -> Matrix:
+    return Matrix(tree, socket)
