@@ -42,6 +42,10 @@ class Export:
             for name, camera in capture.cameras.items()
         }
 
+    def part(self, index: int, count: int) -> "Export":
+        """The same export for one of `count` equal parts of the work, counted from 0; notes go to the same list."""
+        return replace(self, on_progress=lambda done, total: self.show(index * total + done, count * total))
+
     def show(self, done: int, total: int) -> None:
         """Report progress to whoever listens."""
         if self.on_progress:
@@ -198,11 +202,11 @@ class _Lenses:
 
 def _note_lenses(capture: Capture, targets: Mapping[str, Camera], export: Export) -> None:
     changed = [name for name in targets if not same_lens(capture.cameras[name], targets[name])]
-    if changed and export.rectify is None:
-        export.notes.append(
-            f"Pictures of {len(changed)} of {len(targets)} cameras are resampled: "
-            "the layout cannot describe their lenses."
-        )
+    note = (
+        f"Pictures of {len(changed)} of {len(targets)} cameras are resampled: the layout cannot describe their lenses."
+    )
+    if changed and export.rectify is None and note not in export.notes:
+        export.notes.append(note)
 
 
 def _write_png(path: Path, picture: Picture) -> None:

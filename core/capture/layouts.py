@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import HoloreelError
-from . import colmap, immersive, n3v, nerfstudio, sfm_result, technicolor, videos
+from . import colmap, immersive, n3v, nerfstudio, rerf, sfm_result, technicolor, videos
 from .capture import Capture, View
 from .export import Export, file_names, write_pictures
 from .media import Media
@@ -89,6 +89,14 @@ LAYOUTS = {
         colmap.read,
         colmap.write,
         holds_seeds=True,
+    ),
+    "rerf": Layout(
+        "image/CCC.mp4, mask/CCC.mp4, CamPose.inf and Intrinsic.inf, or cams_FRAME.json",
+        rerf.matches,
+        rerf.read,
+        rerf.write,
+        held_out=rerf.HELD_OUT,
+        names=rerf.names,
     ),
     "videos": Layout("a video per camera", videos.matches, videos.read, videos.write),
 }

@@ -18,13 +18,13 @@ from .media import Media
 from .options import CaptureOptions
 from .picture_set import check_pictures
 from .rotations import matrix_from_quaternion, quaternion_from_matrix
+from .tables import read_rows
 
 FILE_NAME = "cameras_parameters.txt"
 HEADINGS = "f cu cv ar sk qw qx qy qz tx ty tz"
 HELD_OUT = "cam10"
 _PICTURE = re.compile(r"(?P<scene>.+)_undist_(?P<frame>\d{1,7})_(?P<camera>\d{1,4})\.png")
 _MAX_CAMERAS = 10_000
-_MAX_BYTES = 1 << 22
 _MAX_SKEW = 1e-3  # of the focal length: what is smaller moves no pixel by one
 
 
@@ -75,22 +75,12 @@ def read(path: Path, options: CaptureOptions) -> Capture:
 
 
 def _rows(file: Path) -> list[list[float]]:
-    try:
-        with file.open("rb") as stream:
-            text = stream.read(_MAX_BYTES + 1)
-    except OSError as error:
-        raise HoloreelError(f"{file} cannot be read ({error.strerror or error}): fetch it again.") from error
-    lines = [line.split() for line in text.decode("utf-8", "replace").splitlines()[1:] if line.strip()]
-    if not 1 <= len(lines) <= _MAX_CAMERAS or len(text) > _MAX_BYTES:
+    rows = read_rows(file, skip=1)
+    if not 1 <= len(rows) <= _MAX_CAMERAS:
         raise HoloreelError(f"{file} must have a line of headings and a row per camera: fetch it again.")
-    rows = []
-    for number, words in enumerate(lines):
-        try:
-            rows.append([float(word) for word in words])
-        except ValueError as error:
-            raise HoloreelError(f"{file}: row {number} is no row of numbers ({error}): fetch it again.") from error
-        if len(rows[-1]) != 12:
-            raise HoloreelError(f"{file}: row {number} has {len(words)} numbers, not the 12 of {HEADINGS!r}.")
+    if wrong := [(number, len(row)) for number, row in enumerate(rows) if len(row) != 12]:
+        number, count = wrong[0]
+        raise HoloreelError(f"{file}: row {number} has {count} numbers, not the 12 of {HEADINGS!r}: fetch it again.")
     return rows
 
 

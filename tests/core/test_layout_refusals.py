@@ -43,8 +43,10 @@ def originals(tmp_path_factory: pytest.TempPathFactory) -> Path:
         for frame in range(5):
             images[name, frame] = folder / "pictures" / f"{name}_{frame}.png"
             images[name, frame].parent.mkdir(exist_ok=True)
-            iio.imwrite(images[name, frame], shade(index, frame))
-    capture = Capture(cameras, images, 5, {"cam00": "test"}, fps=6.0, frame_start=0)
+            opaque = np.full((16, 32, 1), 255, np.uint8)
+            iio.imwrite(images[name, frame], np.concatenate([shade(index, frame), opaque], axis=2))
+    box = ((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0))
+    capture = Capture(cameras, images, 5, {"cam00": "test"}, fps=6.0, frame_start=0, bounds=box)
     for name, layout in LAYOUTS.items():
         layout.write(capture, folder / name, Export())
     return folder
@@ -78,7 +80,7 @@ def edit_json(path: Path, change: Callable[[list], object]) -> None:
     path.write_text(json.dumps(value))
 
 
-VIDEO_NAMES = {"n3v": "cam01.mp4", "immersive": "camera_0002.mp4", "videos": "cam01.mp4"}
+VIDEO_NAMES = {"n3v": "cam01.mp4", "immersive": "camera_0002.mp4", "videos": "cam01.mp4", "rerf": "image/001.mp4"}
 
 
 @pytest.mark.parametrize("layout", LAYOUTS)
@@ -99,7 +101,7 @@ def test_a_missing_video(scene: Callable[[str], Path], layout: str) -> None:
 @pytest.mark.parametrize("layout", VIDEO_NAMES)
 def test_a_video_too_many(scene: Callable[[str], Path], layout: str) -> None:
     folder = scene(layout)
-    make_video(folder / "cam07.mp4", 1, 5)
+    make_video((folder / VIDEO_NAMES[layout]).with_name("cam07.mp4"), 1, 5)
     refuse(folder, "cam07")
 
 
@@ -445,6 +447,7 @@ TABLES = {
     "technicolor": ["cameras_parameters.txt"],
     "immersive": ["models.json"],
     "videos": ["cameras_opencv.json", "timestamps.csv"],
+    "rerf": ["CamPose.inf", "Intrinsic.inf", "bbox.json"],
     "colmap": [f"{MODEL}cameras.bin", f"{MODEL}images.bin", f"{MODEL}points3D.bin"],
 }
 
