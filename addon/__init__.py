@@ -6,9 +6,9 @@ from types import ModuleType
 
 def _modules() -> tuple[ModuleType, ...]:
     from .. import operators, panels
-    from . import preferences
+    from . import commands, preferences
 
-    return preferences, operators, panels
+    return preferences, commands, operators, panels
 
 
 def register() -> None:

@@ -6,6 +6,7 @@ import os
 import sys
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -105,12 +106,23 @@ def save_scene(job: dict[str, Any], emit: Emit) -> dict[str, Any]:
     bpy.context.view_layer.objects.active = played
     scene.frame_set(scene.frame_start)
     out = Path(stage.out)
-    partial = out.with_name(f".{out.stem}.partial.blend")
-    out.parent.mkdir(parents=True, exist_ok=True)
-    bpy.ops.wm.save_as_mainfile(filepath=str(partial.absolute()), check_existing=False, compress=True, copy=True)
-    os.replace(partial, out)
+    save_blend(out)
     emit({"event": "saved", "out": str(out)})
     return {"bytes": out.stat().st_size}
+
+
+def save_blend(out: Path) -> None:
+    """Save a copy of the open file as `out`, atomically and compressed."""
+    partial = out.with_name(f".{out.stem}.partial.blend")
+    try:
+        out.parent.mkdir(parents=True, exist_ok=True)
+        bpy.ops.wm.save_as_mainfile(filepath=str(partial.absolute()), check_existing=False, compress=True, copy=True)
+        os.replace(partial, out)
+    except (OSError, RuntimeError) as error:
+        with suppress(OSError):
+            partial.unlink()
+        reason = str(error).strip().splitlines()[-1]
+        raise HoloreelError(f"{out} cannot be written ({reason}): choose another place for the .blend.") from error
 
 
 def _new_scene(setting: Setting) -> bpy.types.Scene:
