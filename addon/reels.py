@@ -33,6 +33,8 @@ TIMELINE_INPUTS = {
     "first": "First Frame",
     "last": "Last Frame",
     "repeat": "Repeat",
+    "retime": "Retime",
+    "at": "Reel Frame",
 }
 
 FROM_FILE = "FILE"
@@ -158,7 +160,7 @@ def create_reel_object(
     modifier = created.modifiers.new(MODIFIER, "NODES")
     modifier.node_group = reel()
     set_timeline(created, timeline)
-    _follow_resolution(created)
+    follow_resolution(created)
     return created
 
 
@@ -219,7 +221,7 @@ def _set_scene_timing(scene: bpy.types.Scene, played: Clip, start: float) -> Non
     scene.frame_end = math.ceil(start) + played.frame_count - 1
 
 
-def _follow_resolution(played: bpy.types.Object) -> None:
+def follow_resolution(played: bpy.types.Object) -> None:
     """Drive the look's picture size by the resolution of whatever scene the reel is in."""
     modifier = modifier_of(played)
     sources = {"percent": "render.resolution_percentage"}
