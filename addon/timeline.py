@@ -12,19 +12,22 @@ REPEATS = {
     PING_PONG: "Play forward, then backward, and so on",
 }
 
+FRAME_ROUNDING = 1e-3  # of a frame: what float32 leaves of a whole frame that was scaled is one
+
 
 @dataclass(frozen=True)
 class Timeline:
     """The mapping of a reel with `frame_count` frames, of which `first` to `last` (inclusive, from 0) are played.
 
-    At scene frame f (sub-frames count), u = (f − start) · speed + offset reel frames have passed since `first`. With
+    At scene frame f (sub-frames count), u = (f − start) · speed + offset reel frames have passed since `first`; or, if
+    `retime` is set, u = at − first, whatever f is: `at` is the reel frame, to be keyed or driven. With
     L = last − first + 1:
 
         Hold       v = min(max(u, 0), L − 1)
         Loop       v = u mod L
         Ping-Pong  v = m if m ≤ L − 1 else 2 (L − 1) − m,   m = u mod 2 (L − 1)
 
-    The reel shows its frame first + v, that is its normalized time t = (first + v) / frame_count.
+    The reel shows its frame min(first + v, frame_count), that is its normalized time t = frame / frame_count.
     """
 
     frame_count: int
@@ -34,6 +37,8 @@ class Timeline:
     first: int = 0
     last: int | None = None  # None: the reel's last frame
     repeat: str = HOLD
+    retime: bool = False
+    at: float = 0.0
 
     @property
     def last_frame(self) -> int:
@@ -44,7 +49,10 @@ class Timeline:
         """Return the reel frame shown at a scene frame, rounded step by step as the nodes do (float32)."""
         number = np.float32
         steps = number(max(self.last_frame - self.first, 0))
-        passed = (number(frame) - number(self.start)) * number(self.speed) + number(self.offset)
+        if self.retime:
+            passed = number(self.at) - number(self.first)
+        else:
+            passed = (number(frame) - number(self.start)) * number(self.speed) + number(self.offset)
         if self.repeat == HOLD:
             shown = min(max(passed, number(0)), steps)
         elif self.repeat == LOOP:
@@ -52,7 +60,12 @@ class Timeline:
         else:
             there_and_back = _modulo(passed, number(2) * steps)
             shown = min(there_and_back, number(2) * steps - there_and_back)
-        return number(self.first) + shown
+        return min(number(self.first) + shown, number(self.frame_count))
+
+    def whole_frame(self, frame: float) -> int:
+        """Return the frame of a VideoRF shown at a scene frame: it has no sub-frames, the earlier of two is shown."""
+        shown = np.floor(self.reel_frame(frame) + np.float32(FRAME_ROUNDING))
+        return min(max(int(shown), 0), self.frame_count - 1)
 
     def time(self, frame: float) -> np.float32:
         """Return the reel's normalized time at a scene frame."""

@@ -59,6 +59,9 @@ class Boolean(Value):
     def __and__(self, other: "Boolean") -> "Boolean":
         return self._logic("AND", self, other)
 
+    def __or__(self, other: "Boolean") -> "Boolean":
+        return self._logic("OR", self, other)
+
     def __invert__(self) -> "Boolean":
         return self._logic("NOT", self)
 
@@ -98,6 +101,11 @@ class Matrix(Value):
     def transform(self, point: "VectorLike") -> "Vector":
         """Return a point transformed by this."""
         node = self.tree.node("FunctionNodeTransformPoint", {"Vector": point, "Transform": self})
+        return Vector(self.tree, node.outputs[0])
+
+    def turn(self, direction: "VectorLike") -> "Vector":
+        """Return a direction transformed by this: without the last column."""
+        node = self.tree.node("FunctionNodeTransformDirection", {"Direction": direction, "Transform": self})
         return Vector(self.tree, node.outputs[0])
 
 
@@ -394,6 +402,10 @@ class Tree:
             socket = next(socket for socket in node.outputs if socket.enabled and socket.name == "Attribute")
             self._attributes[name] = ATTRIBUTES[kind](self, socket)
         return self._attributes[name]
+
+    def has_attribute(self, name: str, kind: str) -> Boolean:
+        """Return the field of whether there is a named attribute."""
+        return Boolean(self, self.attribute(name, kind).socket.node.outputs["Exists"])
 
     def position(self) -> Vector:
         """Return the field of positions."""

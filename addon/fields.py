@@ -1,0 +1,209 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""VideoRF reels as Blender objects: one point cloud with the vertices of all groups, and the movie beside the reel.
+
+The points say where each vertex lies, in the world and in the movie; the modifier reads the movie frame by frame, from
+where it lies. The .blend holds the points, never the movie.
+"""
+
+import zlib
+from pathlib import Path
+
+import bpy
+import numpy as np
+from numpy.typing import NDArray
+
+from ..core.errors import HoloreelError
+from ..core.videorf.codec import FeatureVideo
+from ..core.videorf.decode import find_rung, frames_text, rung_name
+from ..core.videorf.mapping import MappingTable
+from ..core.videorf.package import VideoReel
+from ..core.videorf.shading import Shading
+from .attributes import Kind
+from .compat import get_input, new_point_cloud, set_input
+from .nodes.field import FIRST, LAST, NAME, POINT_SIZE, UV, field_reel
+from .nodes.library import is_tagged
+from .reels import INFO, MODIFIER, follow_resolution, modifier_of, set_timeline
+from .timeline import Timeline
+
+MAX_POINTS = 100_000_000  # of all groups together: 32 bytes each
+
+Columns = dict[str, tuple[Kind, NDArray[np.float32]]]
+
+
+def add_field_reel(
+    context: bpy.types.Context,
+    reel: VideoReel,
+    *,
+    timeline: Timeline,
+    name: str,
+    rung: int | str | None = None,
+) -> bpy.types.Object:
+    """Return a new object that plays a VideoRF by `timeline`, in the context's collection.
+
+    `rung` is as in `find_rung`: None takes the best one that is there. Raises `HoloreelError` where a payload is
+    missing, damaged, or of another training, and where Blender decodes the movie to other values; then nothing is
+    added.
+    """
+    shading = reel.shade()
+    columns = point_columns(reel)
+    chosen, report = _available_rung(reel, rung)
+    video = reel.video(chosen)
+    lost = [group for group in video.missing()]
+    whole = [group for group in video.video.groups if group not in lost]
+    for group in whole:
+        video.check(group)
+    if lost:
+        frames = frames_text([frame for group in lost for frame in range(group.first, group.first + group.frames)])
+        report.append(f"{video.path.name} is cut off: {frames} cannot be shown; fetch the rest of it.")
+    movie = _load_movie(video, bool(whole))
+    created = _create(context, name, columns, reel, shading)
+    set_timeline(created, timeline)
+    modifier = modifier_of(created)
+    set_input(modifier, "Point Size", POINT_SIZE)
+    set_input(modifier, "Movie", movie)
+    follow_resolution(created)
+    report.append(f"The features stay in {video.path.name}: keep it where it is, or beside the reel.")
+    created[INFO] = {
+        "source": str(reel.path),
+        "kind": "videorf",
+        "fps": reel.fps,
+        "frame_count": reel.frame_count,
+        "points": len(created.data.points),
+        "groups": len(reel.groups),
+        "rung": rung_name(reel.rungs[chosen]),
+        "report": "\n".join(report),
+    }
+    return created
+
+
+def set_rung(played: bpy.types.Object, reel: VideoReel, rung: int | str | None = None) -> str:
+    """Let an object play another rung of its reel, or the same one of a reel that was moved; returns its name.
+
+    Raises `HoloreelError` where the movie is missing, damaged, or of another training than the object's points.
+    """
+    modifier = field_modifier(played)
+    if modifier is None:
+        raise HoloreelError(f"object '{played.name}' plays no VideoRF: choose one that does.")
+    if modifier.node_group != field_reel(reel, reel.shade()):
+        raise HoloreelError(f"{reel.path} is of another training than object '{played.name}': import it anew.")
+    chosen, _ = _available_rung(reel, rung)
+    video = reel.video(chosen)
+    movie = _load_movie(video, not video.missing())
+    set_input(modifier, "Movie", movie)
+    info = dict(played.get(INFO, {}))
+    played[INFO] = {**info, "source": str(reel.path), "rung": rung_name(reel.rungs[chosen])}
+    return rung_name(reel.rungs[chosen])
+
+
+def field_modifier(played: bpy.types.Object | None) -> bpy.types.NodesModifier | None:
+    """Return the modifier that plays a VideoRF; None if the object plays none."""
+    modifier = modifier_of(played)
+    return modifier if modifier is not None and is_tagged(modifier.node_group, NAME) else None
+
+
+def movie_of(played: bpy.types.Object) -> bpy.types.Image | None:
+    """Return the movie that an object plays; None if it has none."""
+    modifier = field_modifier(played)
+    return None if modifier is None else get_input(modifier, "Movie")
+
+
+def movie_problem(played: bpy.types.Object) -> str | None:
+    """Say in a sentence why an object that plays a VideoRF has nothing to play; None if all is well."""
+    modifier = field_modifier(played)
+    if modifier is None:
+        return None
+    movie = get_input(modifier, "Movie")
+    if movie is None:
+        return "No movie is chosen: take the reel's .mp4"
+    path = Path(bpy.path.abspath(movie.filepath, library=movie.library))
+    if not path.is_file():
+        return f"{path.name} is missing: put it back, or find it"
+    return None
+
+
+def point_columns(reel: VideoReel) -> Columns:
+    """Return the attributes of the points: the vertices of all groups, one group after the other.
+
+    `position` is in the reel's world; `field_uv` is the middle of the pixel of channel 0 in the movie's picture, v up;
+    `field_first` and `field_last` are the frames of the vertex's group, counted from 0.
+    """
+    count = sum(group.vertices for group in reel.groups)
+    if count > MAX_POINTS:
+        raise HoloreelError(f"{reel.path} has {count:,} points in all groups, too many for one object: split the reel.")
+    places, uvs = np.empty((count, 3), np.float32), np.zeros((count, 3), np.float32)
+    first, last = np.empty(count, np.float32), np.empty(count, np.float32)
+    start = 0
+    for index, (entry, frame) in enumerate(zip(reel.groups, reel.firsts, strict=True)):
+        rows = slice(start, start + entry.vertices)
+        table = reel.table(index)
+        places[rows] = reel.lattice.positions(table.vertices)
+        uvs[rows, :2] = _uv(table, reel.tiling.picture)
+        first[rows], last[rows] = frame, frame + entry.frames - 1
+        start = rows.stop
+    return {
+        "position": (Kind.VECTOR, places),
+        UV: (Kind.VECTOR, uvs),
+        FIRST: (Kind.FLOAT, first),
+        LAST: (Kind.FLOAT, last),
+    }
+
+
+def _uv(table: MappingTable, picture: tuple[int, int]) -> NDArray[np.float64]:
+    row, column = np.divmod(table.pixels, table.size[1])
+    return np.stack(((column + 0.5) / picture[1], 1.0 - (row + 0.5) / picture[0]), 1)
+
+
+def _available_rung(reel: VideoReel, wanted: int | str | None) -> tuple[int, list[str]]:
+    """Return the rung to play; the best one that is there, and a sentence about it, if it is not the reel's best."""
+    best = find_rung(reel, wanted)
+    if wanted is not None or (reel.path.parent / reel.rungs[best].file).is_file():
+        return best, []
+    order = sorted(range(len(reel.rungs)), key=lambda k: (reel.rungs[k].codec != "h264", reel.rungs[k].qp))
+    for candidate in order:
+        if (reel.path.parent / reel.rungs[candidate].file).is_file():
+            return candidate, [
+                f"{reel.rungs[best].file} is missing: rung {rung_name(reel.rungs[candidate])} is shown instead."
+            ]
+    raise HoloreelError(f"{reel.path}: its movie '{reel.rungs[best].file}' is missing; put it beside the reel.")
+
+
+def _load_movie(video: FeatureVideo, check: bool) -> bpy.types.Image:
+    """Return the image data-block of a movie. With `check`, its first picture must be the one that was encoded."""
+    try:
+        movie = bpy.data.images.load(str(video.path), check_existing=True)
+    except RuntimeError as error:
+        raise HoloreelError(f"{video.path} cannot be opened as a movie ({error}): fetch it again.") from error
+    movie.colorspace_settings.name = "Non-Color"
+    movie.alpha_mode = "NONE"
+    if check and (tuple(movie.size[::-1]) != video.picture or _first_crc(movie) != video.video.groups[0].luma_crc32):
+        if movie.users == 0:
+            bpy.data.images.remove(movie)
+        raise HoloreelError(
+            f"Blender decodes {video.path} to other values than were encoded: take a rung of another codec, or fetch "
+            f"the original file."
+        )
+    return movie
+
+
+def _first_crc(movie: bpy.types.Image) -> int:
+    width, height = movie.size
+    pixels = np.empty(height * width * 4, np.float32)
+    movie.pixels.foreach_get(pixels)
+    red = pixels.reshape(height, width, 4)[::-1, :, 0]
+    return zlib.crc32(np.rint(red * 255).astype(np.uint8).tobytes())
+
+
+def _create(
+    context: bpy.types.Context, name: str, columns: Columns, reel: VideoReel, shading: Shading
+) -> bpy.types.Object:
+    group = field_reel(reel, shading)
+    created = new_point_cloud(context, name, len(columns["position"][1]))
+    attributes = created.data.attributes
+    for column, (kind, _) in columns.items():  # all are created before any is filled: creating one may move the others
+        if column not in attributes:
+            attributes.new(column, kind.type_name, "POINT")
+    for column, (kind, values) in columns.items():
+        attributes[column].data.foreach_set(kind.property_name, values.ravel())
+    modifier = created.modifiers.new(MODIFIER, "NODES")
+    modifier.node_group = group
+    return created
