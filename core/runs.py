@@ -5,7 +5,11 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 
+from .camera import Camera
+from .capture import Capture
 from .errors import HoloreelError
+
+PREVIEW_PIXELS = 256  # along the longer side
 
 
 def claim_folder(folder: Path) -> None:
@@ -33,6 +37,13 @@ def claim_run(reel: Path, checkpoint: Path, resume: bool) -> None:
         )
     if resume and not checkpoint.exists():
         raise HoloreelError(f"{checkpoint}: no checkpoint to resume from; leave --resume away to start anew.")
+
+
+def preview_camera(capture: Capture) -> Camera:
+    """Return the camera whose view a run shows while it trains: the first that is held out, else the first; small."""
+    camera = capture.cameras[(capture.camera_names("test") or capture.camera_names())[0]]
+    shrink = min(1.0, PREVIEW_PIXELS / max(camera.width, camera.height))
+    return camera.scaled(max(1, round(camera.width * shrink)), max(1, round(camera.height * shrink)))
 
 
 @contextmanager

@@ -12,6 +12,7 @@ from tqdm import tqdm
 from ..blender import find_blender
 from ..errors import HoloreelError
 from ..rig import request as rig_request
+from ..status import StatusWriter
 from ..synth import SynthJob, synthesize
 
 
@@ -40,6 +41,7 @@ def run(
     seed: int = 0,
     blender: Path | None = None,
     overwrite: bool = False,
+    status: Path | None = None,
 ) -> None:
     """Render a multi-view capture from a Blender scene; a call that was stopped goes on when it is repeated.
 
@@ -68,6 +70,7 @@ def run(
         seed: Seed of all that is random.
         blender: The blender executable, or a Python that has bpy.
         overwrite: Replace the capture of another job in this folder.
+        status: JSON file that says how far the job is, for programs that look in. Then there is no progress line.
     """
     width, height = parse_size(size)
     request = rig_request(
@@ -75,13 +78,18 @@ def run(
         elevation_degrees=elevation, fov_degrees=fov, span_degrees=span, rise_degrees=rise,
     )  # fmt: skip
     job = SynthJob(scene, request, parse_frames(frames), rig, samples, holdout, film, depth, seed_points, denoise, seed)
-    begin = time.monotonic()
-    with tqdm(unit="view", dynamic_ncols=True, smoothing=0.1) as bar:
+    begin, told = time.monotonic(), StatusWriter(status)
+    with tqdm(unit="view", dynamic_ncols=True, smoothing=0.1, disable=status is not None) as bar:
+        before: list[int] = []  # the views of an earlier call, which say nothing about the speed of this one
 
         def show(done: int, total: int) -> None:
-            if bar.total is None:  # what an earlier call did is no speed of this one
+            if not before:
+                before.append(done)
                 bar.total, bar.initial = total, done
             bar.update(done - bar.n)
+            made = done - before[0]
+            left = (time.monotonic() - begin) / made * (total - done) if made else None
+            told.tell("render", done, total, left, {"views": f"{done} of {total}"})
 
         result = synthesize(job, out, lambda: find_blender(blender), overwrite=overwrite, on_progress=show)
     for warning in result.warnings:

@@ -8,12 +8,13 @@ from typing import Annotated, Literal
 import tyro
 from tqdm import tqdm
 
-from ..capture import Capture, CaptureOptions, read_capture
+from ..capture import CaptureOptions, read_capture
 from ..gaussians.config import PRESETS as PRESETS
 from ..gaussians.config import TrainConfig
 from ..gaussians.run import RunPaths, train_reel
 from ..gaussians.train import Progress
 from ..render import Backend, get_backend
+from ..status import StatusWriter
 
 DEFAULT = "lite"
 
@@ -29,6 +30,7 @@ def command(preset: str) -> Callable[..., None]:
         preset: str = preset,
         resume: bool = False,
         backend: Backend = "auto",
+        status: Path | None = None,
         options: Annotated[CaptureOptions, tyro.conf.arg(name="")] = CaptureOptions(),  # noqa: B008
         config: Annotated[TrainConfig, tyro.conf.arg(name="")] = PRESETS[preset],
     ) -> None:
@@ -41,25 +43,43 @@ def command(preset: str) -> Callable[..., None]:
             preset: settings to start from; the flags below change them.
             resume: go on from the checkpoint of a stopped run.
             backend: which rasterizer.
+            status: JSON file that says how far the run is, for programs that look in; a preview lies beside it. Then
+                there is no progress line.
             options: how the capture is read.
             config: the preset's settings.
         """
-        train(read_capture(capture, options), out, resume, backend, config)
+        train(capture, options, out, resume, backend, StatusWriter(status), config)
 
     return run
 
 
-def train(capture: Capture, out: Path, resume: bool, backend: Backend, config: TrainConfig) -> None:
-    """Train with a progress line on the terminal."""
+def train(
+    folder: Path,
+    options: CaptureOptions,
+    out: Path,
+    resume: bool,
+    backend: Backend,
+    status: StatusWriter,
+    config: TrainConfig,
+) -> None:
+    """Train, with a progress line on the terminal unless there is a status file."""
+    capture = read_capture(folder, options)
     for note in capture.notes:
         print(note)
-    with tqdm(unit="it", dynamic_ncols=True, desc="train") as bar:
+    with tqdm(unit="it", dynamic_ncols=True, desc="train", disable=status.path is not None) as bar:
 
         def show(progress: Progress) -> None:
-            bar.n, bar.total = progress.iteration, progress.iterations
+            done, total = progress.iteration, progress.iterations
+            bar.n, bar.total = done, total
             bar.set_postfix(
                 loss=f"{progress.loss:.4f}", psnr=f"{progress.psnr:.2f}", gaussians=progress.gaussians, refresh=True
             )
+            figures = {
+                "loss": f"{progress.loss:.4f}",
+                "PSNR": f"{progress.psnr:.2f} dB",
+                "Gaussians": f"{progress.gaussians:,}",
+            }
+            status.tell("train", done, total, progress.seconds_left, figures, progress.preview)
 
         try:
             trained = train_reel(capture, out, config, get_backend(backend), show, resume)

@@ -8,7 +8,8 @@ from typing import Annotated, Literal
 import tyro
 from tqdm import tqdm
 
-from ..capture import Capture, CaptureOptions, read_capture
+from ..capture import CaptureOptions, read_capture
+from ..status import StatusWriter
 from ..videorf.config import PRESETS as PRESETS
 from ..videorf.config import VideoConfig
 from ..videorf.encode import reel_size
@@ -29,6 +30,7 @@ def command(preset: str) -> Callable[..., None]:
         resume: bool = False,
         workers: int = 1,
         keep_model: bool = True,
+        status: Path | None = None,
         options: Annotated[CaptureOptions, tyro.conf.arg(name="")] = CaptureOptions(),  # noqa: B008
         config: Annotated[VideoConfig, tyro.conf.arg(name="")] = PRESETS[preset],
     ) -> None:
@@ -42,26 +44,41 @@ def command(preset: str) -> Callable[..., None]:
             resume: go on behind the last frame that a stopped run has finished.
             workers: coarse fields that are trained at once, on machines with many cores.
             keep_model: keep NAME.model, from which other rungs can be made.
+            status: JSON file that says how far the run is, for programs that look in; a preview lies beside it. Then
+                there is no progress line.
             options: how the capture is read.
             config: the preset's settings.
         """
-        train(read_capture(capture, options), out, resume, workers, keep_model, config)
+        train(capture, options, out, resume, workers, keep_model, StatusWriter(status), config)
 
     return run
 
 
-def train(capture: Capture, out: Path, resume: bool, workers: int, keep_model: bool, config: VideoConfig) -> None:
-    """Train with a progress line on the terminal."""
+def train(
+    folder: Path,
+    options: CaptureOptions,
+    out: Path,
+    resume: bool,
+    workers: int,
+    keep_model: bool,
+    status: StatusWriter,
+    config: VideoConfig,
+) -> None:
+    """Train, with a progress line on the terminal unless there is a status file."""
+    capture = read_capture(folder, options)
     for note in capture.notes:
         print(note)
-    with tqdm(unit="it", dynamic_ncols=True, desc="train") as bar:
+    with tqdm(unit="it", dynamic_ncols=True, desc="train", disable=status.path is not None) as bar:
 
         def show(progress: VideoProgress) -> None:
-            bar.n, bar.total = progress.iteration, progress.iterations
+            done, total = progress.iteration, progress.iterations
+            bar.n, bar.total = done, total
             bar.set_description(progress.stage, refresh=False)
             place = f"{progress.frame + 1}/{progress.frames}"
             quality = {} if progress.psnr is None else {"psnr": f"{progress.psnr:.2f}"}
             bar.set_postfix(frame=place, **quality, left=f"{progress.seconds_left:.0f}s")
+            figures = {"frame": place} | ({} if progress.psnr is None else {"PSNR": f"{progress.psnr:.2f} dB"})
+            status.tell(progress.stage, done, total, progress.seconds_left, figures, progress.preview)
 
         try:
             trained = train_video(capture, out, config, show, resume, workers=workers, keep_model=keep_model)

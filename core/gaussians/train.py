@@ -8,7 +8,7 @@ import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from types import ModuleType
 
 import numpy as np
@@ -21,7 +21,8 @@ from ..capture.stream import PictureStream
 from ..errors import HoloreelError
 from ..render.contract import Rendering, Rules
 from ..render.view import DecoderTensors, render_view
-from ..runs import one_torch_thread
+from ..runs import one_torch_thread, preview_camera
+from ..status import Preview
 from .config import TrainConfig
 from .decoder import SHAPES, Decoder
 from .density import SETTINGS, DensityControl
@@ -49,7 +50,7 @@ SEED_PIXELS = (0.3, 60.0)  # smallest and largest standard deviation of a seed
 
 @dataclass(frozen=True)
 class Progress:
-    """What a run has to say every few iterations."""
+    """What a run has to say every few iterations; `preview` draws what it has learned, if it is called at once."""
 
     iteration: int
     iterations: int
@@ -57,6 +58,7 @@ class Progress:
     psnr: float
     gaussians: int
     seconds_left: float
+    preview: Preview | None = field(default=None, compare=False, repr=False)
 
 
 @contextmanager
@@ -189,7 +191,13 @@ class Trainer:
                 self.history.append((self.iteration, loss_mean / counted, psnr, len(self.parameters)))
                 on_progress(
                     Progress(
-                        self.iteration, self.config.iterations, loss_mean / counted, psnr, len(self.parameters), left
+                        self.iteration,
+                        self.config.iterations,
+                        loss_mean / counted,
+                        psnr,
+                        len(self.parameters),
+                        left,
+                        self.preview,
                     )
                 )
                 loss_mean = mse_mean = 0.0
@@ -246,6 +254,12 @@ class Trainer:
             self.rules,
             self.parameters.stats if training else None,
         )
+
+    @torch.no_grad()
+    def preview(self) -> np.ndarray:
+        """Draw the middle frame of what has been learned, small, (H, W, 3)."""
+        middle = self.capture.time(self.capture.frame_count // 2)
+        return self.render(preview_camera(self.capture), middle).features.cpu().numpy()
 
     def _pace(self) -> float:
         """Return what is left of the positions' learning rate."""

@@ -24,12 +24,14 @@ import torch
 from ..capture import Capture
 from ..errors import HoloreelError
 from ..files import atomic_path, read_json, write_json
-from ..runs import claim_run, differences, one_torch_thread
+from ..runs import claim_run, differences, one_torch_thread, preview_camera
+from ..status import Preview
 from .coarse import Coarse, occupancy_of
 from .coarse_frames import CoarseJob, train_coarse_frames
 from .codec import check_rung
 from .config import VideoConfig
 from .deferred import DeferredShading
+from .draw import QUALITY, draw_field
 from .encode import RungSpec, round_trip, write_reel
 from .fine import (
     FrameTrainer,
@@ -98,7 +100,8 @@ class VideoProgress:
     """Where a run stands: `stage` of `STAGES`, the frame worked on (from 0), and steps done of those planned in all.
 
     `psnr` is that of training rays over random backgrounds, near the subject: lower than that of whole pictures; None
-    while nothing is learned.
+    while nothing is learned. `preview` draws the frame as far as it is trained, if it is called at once; None while
+    there is nothing to draw.
     """
 
     stage: str
@@ -108,6 +111,7 @@ class VideoProgress:
     iterations: int
     psnr: float | None
     seconds_left: float
+    preview: Preview | None = field(default=None, compare=False, repr=False)
 
 
 @dataclass(frozen=True)
@@ -218,12 +222,12 @@ class _Run:
 
     # -- what the listener hears
 
-    def _tell(self, stage: str, frame: int, psnr: float | None, steps: int) -> None:
+    def _tell(self, stage: str, frame: int, psnr: float | None, steps: int, preview: Preview | None = None) -> None:
         """Say how far the run is after so many more steps."""
         self.done += steps
         worked = max(self.done - self.skipped, 1)
         left = (time.perf_counter() - self.began) / worked * max(self.planned - self.done, 0)
-        self.on_progress(VideoProgress(stage, frame, self.frames, self.done, self.planned, psnr, left))
+        self.on_progress(VideoProgress(stage, frame, self.frames, self.done, self.planned, psnr, left, preview))
 
     def _skip(self, steps: int) -> None:
         self.done, self.skipped = self.done + steps, self.skipped + steps
@@ -348,7 +352,11 @@ class _Run:
         return FrameTrainer(field_of, views, frame, start, previous, self.config, iterations, trip)
 
     def _heard(self, stage: str, trainer: FrameTrainer) -> None:
-        self._tell(stage, trainer.frame, psnr_of(trainer.error), 1)
+        def preview() -> np.ndarray:
+            shading, camera = self.network.numbers(), preview_camera(self.capture)
+            return draw_field(trainer.group.volume, trainer.table, shading, camera, QUALITY["fast"]).image
+
+        self._tell(stage, trainer.frame, psnr_of(trainer.error), 1, preview)
 
     def _keep(self, frame: int, trainer: FrameTrainer) -> None:
         self.fits[frame] = psnr_of(trainer.error)

@@ -176,7 +176,18 @@ def test_stopped_anywhere_a_run_ends_in_the_same_bits(trained: TrainedVideo, cap
 
 def test_progress_counts_all_steps_up(capture: Capture, tmp_path: Path) -> None:
     heard: list[VideoProgress] = []
-    train_video(capture, tmp_path / "a.reel", replace(SHORT, coarse=CoarseConfig(iterations=5)), heard.append)
+    previews: list[np.ndarray] = []
+
+    def listen(progress: VideoProgress) -> None:
+        heard.append(progress)
+        if progress.preview is not None and not previews:
+            previews.append(progress.preview())
+
+    train_video(capture, tmp_path / "a.reel", replace(SHORT, coarse=CoarseConfig(iterations=5)), listen)
+    (preview,) = previews
+    shown = capture.cameras[(capture.camera_names("test") or capture.camera_names())[0]]
+    assert preview.shape == (shown.height, shown.width, 3)
+    assert preview.min() < 0.8 < preview.max()  # a subject over white
     done = [progress.iteration for progress in heard]
     assert done == sorted(done)
     assert done[-1] == heard[-1].iterations
