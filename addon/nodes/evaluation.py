@@ -7,10 +7,10 @@ from ...core.gaussians.model import OPACITY_MIN
 from .. import timeline
 from ..attributes import PREFIX
 from ..compat import set_wildcard
-from .builder import Float, Geometry, Tree
+from .builder import Boolean, Float, Geometry, Tree
 from .library import node_group
 
-TIMELINE_PANEL = "Timeline"
+TIMELINE_PANEL, DETAIL_PANEL = "Timeline", "Detail"
 
 
 def timeline_inputs(tree: Tree) -> dict[str, Any]:
@@ -30,17 +30,36 @@ def timeline_inputs(tree: Tree) -> dict[str, Any]:
         "Last Frame": tree.integer_input("Last Frame", "Last reel frame to play, counted from 0", 0, 0, panel=panel),
         "Frame Count": tree.integer_input("Frame Count", "Frames the reel was made from", 1, 1, panel=panel),
         "Repeat": tree.menu_input("Repeat", "What to show before the start and after the last frame", panel=panel),
+        "Retime": tree.boolean_input(
+            "Retime",
+            "Show the reel frame below, keyed or driven, instead of following the scene's frames",
+            False,
+            panel,
+        ),
+        "Reel Frame": tree.float_input(
+            "Reel Frame", "Reel frame to show with Retime, counted from 0; fractions show what is between", panel=panel
+        ),
     }
 
 
-@node_group("Holoreel Time", 1, "Map the scene's frame to a reel's time")
+def detail_inputs(tree: Tree) -> dict[str, Float]:
+    """Declare the inputs that leave points out; return them by name."""
+    what = "Percentage of the points to show, the most important first, in"
+    return {
+        name: tree.float_input(name, f"{what} {where}", 100.0, 0.0, 100.0, DETAIL_PANEL)
+        for name, where in (("Viewport Detail", "the viewport"), ("Render Detail", "renders"))
+    }
+
+
+@node_group("Holoreel Time", 2, "Map the scene's frame to a reel's time")
 def time(tree: Tree) -> None:
     """Outputs: Time, normalized; Reel Frame. The same as `timeline.Timeline`."""
     inputs = timeline_inputs(tree)
     frame = Float(tree, tree.node("GeometryNodeInputSceneTime").outputs["Frame"])
     first = inputs["First Frame"]
     steps = (inputs["Last Frame"] - first).at_least(0.0)
-    passed = (frame - inputs["Start Frame"]) * inputs["Speed"] + inputs["Offset"]
+    followed = (frame - inputs["Start Frame"]) * inputs["Speed"] + inputs["Offset"]
+    passed = tree.choose(inputs["Retime"], inputs["Reel Frame"] - first, followed, "FLOAT")
     there_and_back = passed.modulo(2.0 * steps)
     shown = {
         timeline.HOLD: passed.at_least(0.0).at_most(steps),
@@ -48,17 +67,60 @@ def time(tree: Tree) -> None:
         timeline.PING_PONG: there_and_back.at_most(2.0 * steps - there_and_back),
     }
     choices = {name: (tooltip, shown[name]) for name, tooltip in timeline.REPEATS.items()}
-    reel_frame = first + tree.switch(inputs["Repeat"], choices, "FLOAT")
+    reel_frame = (first + tree.switch(inputs["Repeat"], choices, "FLOAT")).at_most(inputs["Frame Count"])
     tree.output("Time", reel_frame / inputs["Frame Count"], "Time in the reel, from 0 to 1")
     tree.output("Reel Frame", reel_frame, "Frame of the reel, counted from 0, with its fraction")
     tree.set_menu_default("Repeat", timeline.HOLD)
 
 
-@node_group("Holoreel Evaluate", 1, "Evaluate Spacetime Gaussians at a time and delete those that cannot be seen then")
+@node_group("Holoreel Segment", 1, "Keep the Gaussians of the segment that a frame lies in")
+def segment(tree: Tree) -> None:
+    """Outputs the points, and their segment's normalized time. Points without `stg_first` belong to every frame.
+
+    A segment of the frames `stg_first` ... is shown from there until `stg_until`, which is beyond all frames for the
+    last; the frame j of its `stg_frames` has the time j / `stg_frames`.
+    """
+    points = tree.geometry_input()
+    frame = tree.float_input("Reel Frame", "Frame of the reel, counted from 0")
+    now = tree.float_input("Time", "Time in a reel without segments, from 0 to 1")
+    first, segmented = tree.attribute("stg_first", "FLOAT"), tree.has_attribute("stg_first", "FLOAT")
+    ended = ~frame.below(tree.attribute("stg_until", "FLOAT"))
+    points = tree.delete_points(points, segmented & (frame.below(first) | ended))
+    own = (frame - first) / tree.attribute("stg_frames", "FLOAT")
+    tree.output("Geometry", points, "Gaussians of the segment")
+    tree.output("Time", tree.choose(segmented, own, now, "FLOAT"), "Time in the segment, from 0 to 1")
+
+
+@node_group("Holoreel Detail", 1, "Keep the first points: the most important, if they are sorted so")
+def detail(tree: Tree) -> None:
+    """Keeps the given percentage, rounded up."""
+    points = tree.geometry_input()
+    inputs = detail_inputs(tree)
+    in_viewport = Boolean(tree, tree.node("GeometryNodeIsViewport").outputs[0])
+    percent = tree.choose(in_viewport, inputs["Viewport Detail"], inputs["Render Detail"], "FLOAT")
+    count = Float(tree, tree.node("GeometryNodeAttributeDomainSize", {0: points}, component="POINTCLOUD").outputs[0])
+    index = Float(tree, tree.node("GeometryNodeInputIndex").outputs[0])
+    fewer = tree.delete_points(points, ~index.below(count * percent / 100.0))
+    tree.output("Geometry", tree.choose(percent.below(100.0), fewer, points, "GEOMETRY"), "Points that are kept")
+
+
+def play(tree: Tree, cloud: Geometry, mapping: dict[str, Any], kept: dict[str, Any]) -> Geometry:
+    """Add the nodes from the points of `attributes.TABLE` to the Gaussians that the scene's frame shows.
+
+    `mapping` comes from `timeline_inputs`, `kept` from `detail_inputs`.
+    """
+    cloud = Geometry(tree, tree.group(detail(), {"Geometry": cloud, **kept}).outputs["Geometry"])
+    clock = {name: Float(tree, socket) for name, socket in tree.group(time(), mapping).outputs.items()}
+    current = tree.group(segment(), {"Geometry": cloud, **clock}).outputs
+    parts = {"Geometry": Geometry(tree, current["Geometry"]), "Time": Float(tree, current["Time"])}
+    return Geometry(tree, tree.group(evaluate(), parts).outputs["Geometry"])
+
+
+@node_group("Holoreel Evaluate", 2, "Evaluate Spacetime Gaussians at a time and delete those that cannot be seen then")
 def evaluate(tree: Tree) -> None:
     """Spacetime Gaussians, Eqs. 7 to 9. Consumes the attributes `stg_*`; stores `opacity` and `rotation`."""
     points = tree.geometry_input()
-    now = tree.float_input("Time", "Time in the reel, from 0 to 1")
+    now = tree.float_input("Time", "Time in the reel or the point's segment, from 0 to 1", is_field=True)
     cut = tree.float_input("Minimum Opacity", "Gaussians below this opacity are deleted", OPACITY_MIN, 0.0, 1.0)
     dt = now - tree.attribute("stg_center", "FLOAT")
 

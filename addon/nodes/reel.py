@@ -5,8 +5,8 @@ from typing import Any
 
 import bpy
 
-from .builder import Float, Geometry, Tree
-from .evaluation import evaluate, time, timeline_inputs
+from .builder import Geometry, Tree
+from .evaluation import detail_inputs, play, timeline_inputs
 from .library import node_group
 from .looks import linear_color, points, points_inputs, splats, splats_inputs
 
@@ -29,17 +29,16 @@ LOOK_PANEL = "Look"
 NAME = "Holoreel Reel"
 
 
-@node_group(NAME, 2, "Play Spacetime Gaussians on the timeline")
+@node_group(NAME, 3, "Play Spacetime Gaussians on the timeline")
 def reel(tree: Tree) -> None:
     """Takes the points of `attributes.TABLE`."""
     cloud = tree.geometry_input()
     look = tree.menu_input("Look", "How the Gaussians are shown", panel=LOOK_PANEL)
     color = tree.menu_input("Color", COLOR_TOOLTIP, panel=LOOK_PANEL)
-    mapping = timeline_inputs(tree)
+    mapping, kept = timeline_inputs(tree), detail_inputs(tree)
     of_points, of_splats = points_inputs(tree), splats_inputs(tree)
 
-    now = Float(tree, tree.group(time(), mapping).outputs["Time"])
-    cloud = _chain(tree, evaluate(), {"Geometry": cloud, "Time": now})
+    cloud = play(tree, cloud, mapping, kept)
     colored = {DISPLAY: cloud, LINEAR: _chain(tree, linear_color(), {"Geometry": cloud})}
     cloud = tree.switch(color, {name: (tip, colored[name]) for name, tip in COLORS.items()}, "GEOMETRY")
     shown = {

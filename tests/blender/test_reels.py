@@ -300,3 +300,63 @@ def test_mapping_reads_back_as_it_was_set(random_model: Model) -> None:
     assert reels.timeline_of(reel) == timeline
     with pytest.raises(HoloreelError, match="no reel"):
         reels.timeline_of(bpy.data.objects.new("Empty", None))
+
+
+def test_ranges_beyond_the_reel_show_its_end(random_model: Model) -> None:
+    model = random_model(300)
+    for repeat in (HOLD, LOOP, PING_PONG):
+        timeline = Timeline(10, first=0, last=500, repeat=repeat)
+        reel = reels.create_reel_object(bpy.context, "reel", model, timeline)
+        show_points(reel)
+        seek(400)
+        assert timeline.time(400) == 1.0
+        assert_same(evaluated(reel), model.evaluate(1.0))
+        reels.set_timeline(reel, Timeline(10, first=90, last=20, repeat=repeat))
+        assert_same(evaluated(reel), model.evaluate(1.0))
+
+
+def test_keyed_and_driven_reel_frames(random_model: Model) -> None:
+    model = random_model(300)
+    timeline = Timeline(40, start=7, speed=3, first=2, last=33, retime=True)
+    reel = reels.create_reel_object(bpy.context, "reel", model, timeline)
+    modifier = show_points(reel)
+    path = compat.input_path(modifier, "Reel Frame")
+    for frame, shown in ((1, 2.0), (11, 32.0), (21, 99.0)):
+        compat.set_input(modifier, "Reel Frame", shown)
+        reel.keyframe_insert(path, frame=frame)
+    for frame, shown in ((1, 2.0), (11, 32.0), (21, 33.0)):  # 99 is beyond the range, which Hold keeps
+        seek(frame)
+        assert_same(evaluated(reel), model.evaluate(shown / 40))
+    reel.animation_data_clear()
+    follow = reel.driver_add(path).driver
+    follow.expression = "frame * 0.5"
+    seek(24.5)
+    assert_same(evaluated(reel), model.evaluate(12.25 / 40))
+    depsgraph = bpy.context.evaluated_depsgraph_get()
+    assert reels.timeline_of(reel.evaluated_get(depsgraph)).at == 12.25
+
+
+def test_keyed_speed_is_read_at_each_frame(random_model: Model) -> None:
+    model = random_model(300)
+    reel = reels.create_reel_object(bpy.context, "reel", model, Timeline(40))
+    modifier = show_points(reel)
+    for frame, speed in ((1, 0.0), (11, 2.0)):
+        compat.set_input(modifier, "Speed", speed)
+        reel.keyframe_insert(compat.input_path(modifier, "Speed"), frame=frame)
+    seek(11)
+    assert_same(evaluated(reel), model.evaluate(20 / 40))
+
+
+@pytest.mark.parametrize(("percent", "kept"), [(100.0, 250), (50.0, 125), (10.1, 26), (0.0, 0)])
+def test_viewport_detail_keeps_the_first(percent: float, kept: int, random_model: Model) -> None:
+    model = random_model(250)
+    model.opacity_logits[:], model.trbf_log_scales[:] = 4, 16
+    reel = reels.create_reel_object(bpy.context, "reel", model, Timeline(10))
+    modifier = show_points(reel)
+    compat.set_input(modifier, "Viewport Detail", percent)
+    assert len(evaluated(reel)["position"]) == kept
+    if kept:
+        assert_same(evaluated(reel), model.take(slice(kept)).evaluate(0.0))
+    compat.set_input(modifier, "Viewport Detail", 100.0)
+    compat.set_input(modifier, "Render Detail", percent)
+    assert len(evaluated(reel)["position"]) == 250
