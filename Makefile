@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 # `make demo` and `make test` do all their own set-up; `make setup` does it alone. Stamps make a second call start at once.
-.PHONY: help setup demo test test-slow lint core-tests blender-tests clean
+.PHONY: help setup demo test test-slow lint core-tests blender-tests extension test-blender clean
 .DEFAULT_GOAL := help
 
 KERNELS := $(wildcard core/render/kernels/* core/videorf/kernels/*) CMakeLists.txt __init__.py
@@ -10,6 +10,8 @@ help:
 	@echo "make demo    the whole loop on a sample scene; ends in demo/report.html"
 	@echo "make test    everything that continuous integration runs"
 	@echo "make setup   only the environments: .venv, .venv-bpy45, .venv-bpy52"
+	@echo "make extension                   dist/holoreel-VERSION.zip, to install in Blender"
+	@echo "make test-blender BLENDER=PATH   that zip in a real Blender"
 	@echo "make lint    ruff and mypy        make test-slow  the slow tests too        make clean"
 
 setup: .venv/.ready .venv/.kernels .venv-bpy45/.ready .venv-bpy52/.ready
@@ -56,5 +58,13 @@ test: setup lint core-tests blender-tests
 test-slow:
 	$(MAKE) test PYTEST_MARK=""
 
+# With BLENDER, that Blender's own builder; without it, the one that the wheels carry.
+extension: $(if $(BLENDER),,.venv-bpy45/.ready .venv-bpy52/.ready)
+	@scripts/extension.sh "$(BLENDER)"
+
+test-blender: extension .venv/.ready .venv/.kernels
+	@[ -n "$(BLENDER)" ] || { echo "say which: make test-blender BLENDER=/path/to/blender" >&2; exit 2; }
+	BLENDER="$(abspath $(BLENDER))" .venv/bin/python -m pytest tests/real_blender
+
 clean:
-	rm -rf build demo .venv .venv-bpy45 .venv-bpy52
+	rm -rf build demo dist .venv .venv-bpy45 .venv-bpy52
