@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from .capture import Capture
 from .capture.images import composite
+from .capture.layouts import protocol_of
 from .draw import Drawing, Player, open_player
 from .errors import HoloreelError
 from .gaussians.decoder import Activation
@@ -95,6 +96,7 @@ def evaluate_player(
         "backend": player.backend_name,
         **player.facts(),
         "precision": "float drawings, 8-bit truth",
+        **_protocol(player, capture, split),
         "size": sizes(player),
         **({"lpips_input": lpips[0].input_range} if lpips else {}),
         "mean": _mean(rows),
@@ -116,6 +118,14 @@ def _truth(
     else:
         picture = capture.image(name, index, background=player.background)
     return picture.astype(np.float32) / 255.0, None if rgba is None else rgba[..., 3] > 0
+
+
+def _protocol(player: Player, capture: Capture, split: str) -> dict[str, Any]:
+    """Return which dataset's protocol this is, if it is one: its name, cameras, measures and background."""
+    protocol = protocol_of(capture) if split == "test" and player.subject_alone else None
+    if protocol is None or protocol.background not in (None, tuple(player.background)):
+        return {}
+    return {"protocol": protocol._asdict() | {"held_out": capture.camera_names("test")}}
 
 
 def _scores(

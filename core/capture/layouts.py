@@ -5,15 +5,23 @@ from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from ..errors import HoloreelError
 from . import colmap, immersive, n3v, nerfstudio, rerf, sfm_result, technicolor, videos
-from .capture import Capture, View
+from .capture import Capture, Triple, View
 from .export import Export, file_names, write_pictures
 from .media import Media
 from .options import CaptureOptions
 from .points import write_points
+
+
+class Protocol(NamedTuple):
+    """How results on a dataset are measured where its held-out cameras are held out."""
+
+    name: str
+    measures: tuple[str, ...]  # of `core.evaluate`
+    background: Triple | None = None  # that subject and drawing lie over; None: it does not matter
 
 
 @dataclass(frozen=True)
@@ -26,6 +34,7 @@ class Layout:
     write: Callable[[Capture, Path, Export], None]
     scale: int = 1  # by which the protocol divides the size of the pictures
     held_out: tuple[str, ...] | None = ()  # cameras to test on; the first where none has these names; None: files say
+    protocol: Protocol | None = None  # that `holoreel eval` names where it was kept
     holds_seeds: bool = False
     names: Callable[[Capture], dict[str, str]] = file_names  # what each camera is called once it is written
 
@@ -96,6 +105,7 @@ LAYOUTS = {
         rerf.read,
         rerf.write,
         held_out=rerf.HELD_OUT,
+        protocol=Protocol("ReRF", ("psnr", "ssim_gauss"), rerf.WHITE),
         names=rerf.names,
     ),
     "videos": Layout("a video per camera", videos.matches, videos.read, videos.write),
@@ -181,6 +191,13 @@ def _splits(capture: Capture, options: CaptureOptions, layout: Layout) -> dict[s
     else:
         held_out = default_held_out(layout, list(capture.cameras))
     return {name: "test" if name in held_out else "train" for name in capture.cameras}
+
+
+def protocol_of(capture: Capture) -> Protocol | None:
+    """Return the protocol whose cameras are held out in a capture, whatever its layout; None where there is none."""
+    held_out = set(capture.camera_names("test"))
+    found = (row.protocol for row in LAYOUTS.values() if row.protocol and held_out == set(row.held_out or ()))
+    return next(found, None)
 
 
 def default_held_out(layout: Layout, names: Sequence[str]) -> list[str]:

@@ -75,6 +75,9 @@ def remarks(metrics: dict[str, Any]) -> list[str]:
             "the pixels of the masks."
         )
     lines.append(f"Compared: {metrics['precision']}.")
+    if protocol := metrics.get("protocol"):
+        measures = ", ".join(LABELS[name] for name in protocol["measures"] if name in metrics["mean"])
+        lines.append(f"Protocol of {protocol['name']} (held out: {', '.join(protocol['held_out'])}): {measures}.")
     return lines
 
 

@@ -36,8 +36,9 @@ def build(job: dict[str, Any], emit: Emit) -> None:
                 bpy.context.object.keyframe_insert("location", frame=frame)
             bpy.context.object.animation_data_create()
             linear(bpy.context.object)
-    bpy.ops.mesh.primitive_plane_add(size=40)
-    bpy.context.object.data.materials.append(glow("floor", (0.02, 0.02, 0.02)))
+    if job.get("floor", True):
+        bpy.ops.mesh.primitive_plane_add(size=40)
+        bpy.context.object.data.materials.append(glow("floor", (0.02, 0.02, 0.02)))
     if job.get("camera", True):
         bpy.ops.object.camera_add(location=(0.3, -4.0, 2.0))
         scene.camera = bpy.context.object
