@@ -31,31 +31,96 @@ def registered() -> Iterator[None]:
 
 
 def ours() -> set[str]:
-    """Return everything of ours that Blender knows."""
+    """Return everything of ours that Blender knows: types, properties, operators, draw functions, handlers."""
     types = {name for name in dir(bpy.types) if "holoreel" in name.lower()}
     operators = {f"ops.{name}" for name in dir(bpy.ops.holoreel)} if "holoreel" in dir(bpy.ops) else set()
-    menus = {f"menu.{entry.__module__}" for entry in bpy.types.TOPBAR_MT_file_import._dyn_ui_initialize()}
-    return types | operators | {menu for menu in menus if "holoreel" in menu}
+    found = types | operators
+    for name in dir(bpy.types):
+        kind = getattr(bpy.types, name)
+        found |= {f"{name}.{attribute}" for attribute in dir(kind) if attribute.startswith("holoreel")}
+        for function in getattr(getattr(kind, "draw", None), "_draw_funcs", ()):
+            if "holoreel" in function.__module__:
+                found.add(f"draw.{name}.{function.__module__}")
+    for name in dir(bpy.app.handlers):
+        handlers = getattr(bpy.app.handlers, name)
+        if isinstance(handlers, list):
+            found |= {f"handler.{name}" for handler in handlers if "holoreel" in handler.__module__}
+    return found
 
 
 def test_registering_twice_leaves_nothing_behind() -> None:
     assert ours() == set()
     for _ in range(2):
         holoreel.register()
-        assert {"HOLOREEL_OT_import_reel", "HOLOREEL_PT_reel", "menu.holoreel.operators.import_reel"} <= ours()
+        assert {
+            "HOLOREEL_OT_import_reel",
+            "HOLOREEL_PT_reel",
+            "draw.TOPBAR_MT_file_import.holoreel.operators.import_reel",
+        } <= (ours())
         holoreel.unregister()
         assert ours() == set()
 
 
+def classes() -> list[type]:
+    """Return all registered classes of ours."""
+    return [getattr(bpy.types, name) for name in sorted(ours()) if "." not in name]
+
+
+def is_well_put(text: str) -> bool:
+    """Tooltips begin with a capital and end without a period, as Blender's own do."""
+    return bool(text) and text == text.strip() and not text[0].islower() and not text.endswith((".", "!"))
+
+
 @pytest.mark.usefixtures("registered")
-def test_operators_and_panels_explain_themselves() -> None:
-    for name in ours():
-        kind = getattr(bpy.types, name, None)
-        if kind is not None and issubclass(kind, bpy.types.Operator):
-            assert kind.bl_description
-            for prop in kind.bl_rna.properties:
-                if not prop.is_hidden and prop.identifier in kind.__annotations__:
-                    assert prop.description, (name, prop.identifier)
+def test_every_class_and_property_explains_itself() -> None:
+    mute = []
+    for kind in classes():
+        if issubclass(kind, bpy.types.Operator) and not is_well_put(kind.bl_description):
+            mute.append((kind.__name__, kind.bl_description))
+        for prop in kind.bl_rna.properties:
+            if prop.identifier not in getattr(kind, "__annotations__", {}) or prop.is_hidden:
+                continue
+            texts = [prop.description, *(item.description for item in getattr(prop, "enum_items", ()))]
+            mute += [(kind.__name__, prop.identifier, text) for text in texts if not is_well_put(text)]
+    assert not mute
+
+
+@pytest.mark.usefixtures("registered")
+def test_operators_are_named_alike_and_can_be_searched() -> None:
+    operators = [kind for kind in classes() if issubclass(kind, bpy.types.Operator)]
+    small = {"a", "an", "as", "by", "from", "in", "of", "on", "the", "to", "with", "and", "for"}
+    for kind in operators:
+        assert kind.__name__.startswith("HOLOREEL_OT_"), kind
+        words = kind.bl_label.removesuffix("...").split()
+        assert words, kind
+        assert all(word[0].isupper() or word in small or not word[0].isalpha() for word in words), kind.bl_label
+        assert "INTERNAL" not in kind.bl_options, kind
+    labels = [kind.bl_label for kind in operators]
+    assert len(set(labels)) == len(labels), labels
+
+
+@pytest.mark.usefixtures("registered")
+def test_operators_that_cannot_run_say_why(capfd: pytest.CaptureFixture[str]) -> None:
+    for name in dir(bpy.ops.holoreel):
+        operator = getattr(bpy.ops.holoreel, name)
+        if operator.poll():
+            continue
+        with pytest.raises(RuntimeError) as refusal:
+            operator()
+        assert "context is incorrect" not in str(refusal.value), f"{name} does not say why: {refusal.value}"
+    capfd.readouterr()
+
+
+@pytest.mark.usefixtures("registered")
+def test_inputs_of_node_groups_explain_themselves(
+    random_model: Callable[..., SpacetimeGaussians], tmp_path: Path
+) -> None:
+    write_ply(tmp_path / "a.ply", random_model(10))
+    bpy.ops.holoreel.import_reel(filepath=str(tmp_path / "a.ply"))
+    tree = reels.modifier_of(bpy.context.object).node_group
+    sockets = [item for item in tree.interface.items_tree if item.item_type == "SOCKET"]
+    assert len(sockets) > 10
+    assert not [(item.name, item.description) for item in sockets if not is_well_put(item.description)]
 
 
 @pytest.mark.usefixtures("registered")
