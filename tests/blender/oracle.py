@@ -75,6 +75,33 @@ def splat(
     return np.concatenate([color, 1 - through[..., None]], axis=-1)
 
 
+def trace(
+    gaussians: EvaluatedGaussians,
+    origins: NDArray[np.float64],
+    directions: NDArray[np.float64],
+    world: NDArray[np.float64] | None = None,
+) -> NDArray[np.float64]:
+    """Return premultiplied RGBA (rays, 4): each Gaussian counts with its greatest value along the ray.
+
+    Compositing is by where that is. Gaussians whose greatest value lies behind a ray's origin do not count for it.
+    """
+    alive = gaussians.take(gaussians.alive)
+    centers, spreads = place(alive, world)
+    alphas, distances = np.zeros((len(alive), len(origins))), np.zeros((len(alive), len(origins)))
+    for index, inverse in enumerate(np.linalg.inv(spreads)):
+        start, step = (origins - centers[index]) @ inverse.T, directions @ inverse.T
+        distances[index] = -np.sum(start * step, axis=1) / np.sum(step * step, axis=1)
+        nearest = start + distances[index][:, None] * step
+        value = alive.opacities[index] * np.exp(-0.5 * np.sum(nearest * nearest, axis=1))
+        alphas[index] = np.where((value < ALPHA_MIN) | (distances[index] < 0), 0.0, np.minimum(ALPHA_MAX, value))
+    order = np.argsort(distances, axis=0)
+    alphas = np.take_along_axis(alphas, order, axis=0)
+    through = np.cumprod(np.concatenate([np.ones((1, len(origins))), 1 - alphas]), axis=0)
+    colors = alive.features[:, :3].astype(np.float64)[order]
+    color = np.sum((through[:-1] * alphas)[..., None] * colors, axis=0)
+    return np.concatenate([color, 1 - through[-1][:, None]], axis=1)
+
+
 def psnr(picture: NDArray, truth: NDArray) -> float:
     """Return the peak signal-to-noise ratio in dB, for a peak of 1."""
     error = np.mean(np.square(picture.astype(np.float64) - truth))
