@@ -389,7 +389,10 @@ def test_names_of_this_layout_are_kept() -> None:
 
 def test_losses_are_told_in_the_new_names(tmp_path: Path) -> None:
     made = ball_capture(tmp_path / "ball", 1, dome(8), splits={"cam02": "test", "cam05": "test"})
-    told = " ".join(convert(made, "rerf", tmp_path / "out", {}, Export()))
+    steps: list[tuple[int, int]] = []
+    told = " ".join(convert(made, "rerf", tmp_path / "out", {}, Export(on_progress=lambda *step: steps.append(step))))
+    assert [done for done, _ in steps] == sorted(done for done, _ in steps)
+    assert {total for _, total in steps} == {16} == {steps[-1][0]}  # pictures and masks
     assert "Held out were cam02, cam05, but what is read in this layout holds 006 out by default" in told
     assert "read it with --test-cameras 000 006." in told
     assert np.array_equal(
