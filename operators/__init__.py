@@ -5,9 +5,9 @@ from types import ModuleType
 
 
 def _modules() -> tuple[ModuleType, ...]:
-    from . import import_reel, setup_exact_render
+    from . import add_crop_box, import_reel, setup_exact_render
 
-    return import_reel, setup_exact_render
+    return import_reel, setup_exact_render, add_crop_box
 
 
 def register() -> None:
