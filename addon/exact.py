@@ -4,9 +4,10 @@
 import bpy
 
 from . import compat, reels
-from .nodes.reel import DISPLAY
+from .nodes.show import DISPLAY
 
 TRANSPARENT_BOUNCES = 512  # splats that one ray may cross; more costs only where there are more
+ENOUGH_BOUNCES = 128  # fewer are seen
 CLIP_START, CLIP_END = 0.01, 1e5
 
 
@@ -27,6 +28,21 @@ def setup_exact_render(scene: bpy.types.Scene) -> None:
         modifier = reels.modifier_of(candidate)
         if modifier is not None:
             compat.set_input(modifier, "Color", DISPLAY)
+
+
+def let_rays_through(scene: bpy.types.Scene) -> None:
+    """Let the rays of Cycles pass through as many splats as they meet; a limit that is higher already stays."""
+    cycles = scene.cycles
+    cycles.transparent_max_bounces = max(cycles.transparent_max_bounces, TRANSPARENT_BOUNCES)
+    # Without this, rays that have crossed some splats end at random.
+    cycles.min_transparent_bounces = max(cycles.min_transparent_bounces, TRANSPARENT_BOUNCES)
+
+
+def ends_rays_early(scene: bpy.types.Scene) -> bool:
+    """Return whether the scene is rendered by Cycles with fewer transparent bounces than splats need."""
+    if scene.render.engine != "CYCLES":
+        return False
+    return min(scene.cycles.transparent_max_bounces, scene.cycles.min_transparent_bounces) < ENOUGH_BOUNCES
 
 
 def setup_exact_camera(camera: bpy.types.Camera) -> None:
@@ -57,9 +73,7 @@ def _setup_cycles(scene: bpy.types.Scene) -> None:
     cycles.pixel_filter_type = "BOX"
     cycles.filter_width = 0.01
     cycles.max_bounces = 0
-    cycles.transparent_max_bounces = TRANSPARENT_BOUNCES
-    # Without this, rays that have crossed some splats end at random.
-    cycles.min_transparent_bounces = TRANSPARENT_BOUNCES
+    let_rays_through(scene)
     cycles.sample_clamp_direct = 0.0
     cycles.film_exposure = 1.0
 

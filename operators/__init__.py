@@ -5,9 +5,20 @@ from types import ModuleType
 
 
 def _modules() -> tuple[ModuleType, ...]:
-    from . import add_crop_box, import_reel, setup_exact_render
+    from . import (
+        add_crop_box,
+        environment,
+        import_reel,
+        jobs,
+        let_rays_through,
+        reload_reel,
+        setup_exact_render,
+        synth,
+        train,
+    )
 
-    return import_reel, setup_exact_render, add_crop_box
+    mine = (environment, train, synth, jobs)
+    return import_reel, reload_reel, setup_exact_render, add_crop_box, let_rays_through, *mine
 
 
 def register() -> None:

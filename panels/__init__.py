@@ -5,9 +5,9 @@ from types import ModuleType
 
 
 def _modules() -> tuple[ModuleType, ...]:
-    from . import reel
+    from . import look, reel
 
-    return (reel,)
+    return reel, look
 
 
 def register() -> None:

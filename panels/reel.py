@@ -3,11 +3,17 @@
 
 import bpy
 
-from ..addon.compat import draw_input, get_input
-from ..addon.nodes.reel import LINEAR, POINTS
-from ..addon.reels import INFO, modifier_of
+from ..addon.compat import draw_input, get_input, input_names
+from ..addon.reels import INFO, modifier_of, source_of, summary
+from ..addon.reload import is_field, problem_of
+from ..core.errors import HoloreelError
 from ..operators.import_reel import HOLOREEL_OT_import_reel
-from ..operators.setup_exact_render import HOLOREEL_OT_setup_exact_render
+from ..operators.reload_reel import (
+    HOLOREEL_OT_relink_reel,
+    HOLOREEL_OT_reload_reel,
+    HOLOREEL_OT_store_beside,
+    HOLOREEL_OT_store_inside,
+)
 
 
 class _ReelPanel:
@@ -18,7 +24,7 @@ class _ReelPanel:
     bl_category = "Holoreel"
 
 
-class _SubPanel(_ReelPanel):
+class SubPanel(_ReelPanel):
     """A panel that is there if the active object is a reel."""
 
     bl_parent_id = "HOLOREEL_PT_reel"
@@ -48,61 +54,85 @@ class HOLOREEL_PT_reel(_ReelPanel, bpy.types.Panel):
             self.layout.label(text="The active object is no reel", icon="INFO")
         else:
             self.layout.prop(context.object, "name", text="", icon="POINTCLOUD_DATA")
+            problem = problem_of(context.object)
+            if problem is not None:
+                self.layout.label(text=problem, icon="ERROR")
+                row = self.layout.row(align=True)
+                row.operator(HOLOREEL_OT_reload_reel.bl_idname, text="Reload", icon="FILE_REFRESH")
+                row.operator(HOLOREEL_OT_relink_reel.bl_idname, text="Relink", icon="FILE_FOLDER")
         self.layout.operator(HOLOREEL_OT_import_reel.bl_idname, icon="IMPORT")
 
 
-class HOLOREEL_PT_timeline(_SubPanel, bpy.types.Panel):
+class HOLOREEL_PT_timeline(SubPanel, bpy.types.Panel):
     """How the scene's frames become the reel's time."""
 
     bl_label = "Timeline"
+    bl_order = 1
 
     def draw(self, context: bpy.types.Context) -> None:
         """Draw the mapping."""
-        self.inputs(context, "Start Frame", "Speed", "Offset", "First Frame", "Last Frame", "Frame Count", "Repeat")
+        retimed = get_input(modifier_of(context.object), "Retime")
+        self.inputs(context, "Retime")
+        self.inputs(context, *(["Reel Frame"] if retimed else ["Start Frame", "Speed", "Offset"]))
+        self.inputs(context, "First Frame", "Last Frame", "Repeat")
+        if context.object.get(INFO, {}).get("segments", 1) == 1:
+            self.inputs(context, "Frame Count")
 
 
-class HOLOREEL_PT_look(_SubPanel, bpy.types.Panel):
-    """How the reel is shown."""
+class HOLOREEL_PT_detail(SubPanel, bpy.types.Panel):
+    """How much of the reel is shown."""
 
-    bl_label = "Look"
+    bl_label = "Detail"
+    bl_order = 3
+    bl_options = {"DEFAULT_CLOSED"}
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        """Only for reels whose points are sorted."""
+        modifier = modifier_of(context.object)
+        return modifier is not None and "Viewport Detail" in input_names(modifier.node_group)
 
     def draw(self, context: bpy.types.Context) -> None:
-        """Draw the look, its own settings, and the color mode."""
-        self.inputs(context, "Look", "Color")
-        modifier = modifier_of(context.object)
-        if get_input(modifier, "Color") != LINEAR and context.scene.view_settings.view_transform != "Raw":
-            self.layout.label(text="Exact only with the view transform Raw", icon="ERROR")
-        if get_input(modifier, "Look") == POINTS:
-            self.inputs(context, "Point Size", "Hide Fainter Than")
-            return
-        self.inputs(context, "Low Pass", "Near")
-        if context.scene.camera is None:
-            self.layout.label(text="Splats face the active camera: add one", icon="ERROR")
-        elif context.scene.camera.data.type == "PANO":
-            self.layout.label(text="Splats are for perspective cameras: take Points", icon="ERROR")
-        self.layout.operator(HOLOREEL_OT_setup_exact_render.bl_idname, icon="RENDER_STILL")
+        """Draw the percentages."""
+        self.inputs(context, "Viewport Detail", "Render Detail")
 
 
-class HOLOREEL_PT_info(_SubPanel, bpy.types.Panel):
+class HOLOREEL_PT_info(SubPanel, bpy.types.Panel):
     """Where the reel comes from."""
 
     bl_label = "Info"
+    bl_order = 9
     bl_options = {"DEFAULT_CLOSED"}
 
     def draw(self, context: bpy.types.Context) -> None:
         """Draw source, size and what was found on import."""
-        info = context.object.get(INFO)
+        played = context.object
+        info = played.get(INFO)
         if info is None:
             self.layout.label(text="Made by a script")
             return
         column = self.layout.column(align=True)
-        column.label(text=info["source"], icon="FILE")
-        column.label(text=f"{info['gaussians']:,} Gaussians")
-        column.label(text=f"{info['frame_count']} frames at {info['fps']:g} per second")
+        self._source(column, played)
+        column.label(text=summary(played).partition(": ")[2])
+        if info.get("segments", 1) > 1:
+            column.label(text=f"{info['segments']} segments")
         for sentence in filter(None, info["report"].split("\n")):
             column.label(text=sentence, icon="INFO")
+        row = self.layout.row(align=True)
+        row.operator(HOLOREEL_OT_reload_reel.bl_idname, text="Reload", icon="FILE_REFRESH")
+        row.operator(HOLOREEL_OT_relink_reel.bl_idname, text="Relink", icon="FILE_FOLDER")
+        if not is_field(played):
+            linked = played.data.library is not None
+            store = HOLOREEL_OT_store_inside if linked else HOLOREEL_OT_store_beside
+            self.layout.operator(store.bl_idname, icon="PACKAGE" if linked else "UGLYPACKAGE")
+
+    def _source(self, column: bpy.types.UILayout, played: bpy.types.Object) -> None:
+        try:
+            column.label(text=str(source_of(played)), icon="FILE")
+        except HoloreelError as error:
+            column.label(text=str(error), icon="ERROR")
 
 
-CLASSES = (HOLOREEL_PT_reel, HOLOREEL_PT_timeline, HOLOREEL_PT_look, HOLOREEL_PT_info)
+CLASSES = (HOLOREEL_PT_reel, HOLOREEL_PT_timeline, HOLOREEL_PT_detail, HOLOREEL_PT_info)
 
 register, unregister = bpy.utils.register_classes_factory(CLASSES)
