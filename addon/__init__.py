@@ -6,9 +6,9 @@ from types import ModuleType
 
 def _modules() -> tuple[ModuleType, ...]:
     from .. import operators, panels
-    from . import commands, preferences
+    from . import checkup, commands, jobs, preferences, previews, synthesis, training
 
-    return preferences, commands, operators, panels
+    return preferences, checkup, previews, training, synthesis, jobs, commands, operators, panels
 
 
 def register() -> None:

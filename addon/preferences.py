@@ -9,7 +9,8 @@ from pathlib import Path
 
 import bpy
 
-from . import environment
+from ..core.errors import HoloreelError
+from . import checkup, environment
 from .environment import PACKAGE
 
 _DEVICES = (
@@ -52,6 +53,24 @@ class HoloreelPreferences(bpy.types.AddonPreferences):
         default=_DEFAULTS["log_folder"],
     )
 
+    def draw(self, context: bpy.types.Context) -> None:
+        """Draw the core environment and how it is, then the rest."""
+        layout = self.layout
+        layout.use_property_split = True
+        layout.prop(self, "python")
+        try:
+            found, icon = str(core_python()), "CONSOLE"
+        except HoloreelError as error:
+            found, icon = str(error), "ERROR"
+        layout.label(text=found, icon=icon)
+        for line, icon in checkup.lines():
+            layout.label(text=line, icon=icon)
+        row = layout.row()
+        row.operator("holoreel.check_environment", icon="CHECKMARK")
+        row.operator("holoreel.create_environment", icon="ADD")
+        for name in ("device", "cache_mb", "log_folder"):
+            layout.prop(self, name)
+
 
 def _get(name: str) -> object:
     entry = bpy.context.preferences.addons.get(PACKAGE)
@@ -78,6 +97,13 @@ def log_folder() -> Path:
     """Return the folder of logs and of the state of jobs; it need not exist yet."""
     chosen = str(_get("log_folder"))
     return Path(bpy.path.abspath(chosen)).expanduser() if chosen else environment.user_folder("logs")
+
+
+def choose_environment(python: str) -> None:
+    """Take this core environment from now on, where Blender keeps preferences for the add-on."""
+    entry = bpy.context.preferences.addons.get(PACKAGE)
+    if entry is not None and entry.preferences is not None:
+        entry.preferences.python = python
 
 
 def register() -> None:

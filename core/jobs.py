@@ -17,7 +17,7 @@ import secrets
 import shutil
 import subprocess
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field, replace
 from enum import Enum
@@ -51,7 +51,7 @@ class State(Enum):
 
 @dataclass(frozen=True)
 class Command:
-    """One program to run: its arguments, and what it is called while it runs."""
+    """One program to run: its arguments, and what it is called while it runs; without a title it tells itself."""
 
     title: str
     argv: list[str]
@@ -216,10 +216,18 @@ class Job:
         return sentence if command.startswith("holoreel ") else last.removeprefix("$ ")
 
 
-def begin(folder: Path, record: JobRecord, python: Path, environment: Mapping[str, str]) -> Job:
+def begin(
+    folder: Path,
+    record: JobRecord,
+    python: Path,
+    environment: Mapping[str, str],
+    prepare: Callable[[Path], None] = lambda folder: None,
+) -> Job:
     """Start a job in a new folder inside `folder`; "{job}" in its commands stands for that folder.
 
-    Raises `HoloreelError` where the folder cannot be written or the supervisor not be started.
+    `prepare` is called with the folder first, to put into it what the commands need.
+    Raises `HoloreelError` where the folder cannot be written or the supervisor not be started, or `prepare` does; then
+    nothing is left.
     """
     own = folder / f"{time.strftime('%Y%m%d-%H%M%S')}-{record.kind}-{secrets.token_hex(2)}"
     try:
@@ -231,6 +239,7 @@ def begin(folder: Path, record: JobRecord, python: Path, environment: Mapping[st
     commands = [Command(one.title, [part.replace("{job}", str(own)) for part in one.argv]) for one in record.commands]
     job = Job(own, replace(record, commands=commands))
     try:
+        prepare(own)
         job.launch(python, environment)
     except HoloreelError:
         job.remove()

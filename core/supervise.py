@@ -61,7 +61,7 @@ def main(folder: Path) -> int:
     commands = json.loads((folder / RECORD).read_text(encoding="utf-8"))["commands"]
     end: dict[str, Any] = {"status": 0}
     for index, command in enumerate(commands):
-        if len(commands) > 1:  # a single command tells its own progress
+        if command["title"]:  # others tell their own progress
             _write(folder / STATUS, _status(command["title"], index, len(commands)))
         end = _run(folder, command, lock)
         if end["status"] or end["cancelled"]:
