@@ -25,6 +25,7 @@ from .nodes.library import is_tagged
 from .reels import INFO, MODIFIER, follow_resolution, modifier_of, set_timeline
 from .timeline import Timeline
 
+NON_COLOR = "Non-Color"
 MAX_POINTS = 100_000_000  # of all groups together: 32 bytes each
 
 Columns = dict[str, tuple[Kind, NDArray[np.float32]]]
@@ -48,14 +49,14 @@ def add_field_reel(
     columns = point_columns(reel)
     chosen, report = _available_rung(reel, rung)
     video = reel.video(chosen)
-    lost = [group for group in video.missing()]
+    lost = video.missing()
     whole = [group for group in video.video.groups if group not in lost]
-    for group in whole:
+    for group in whole or lost:
         video.check(group)
     if lost:
         frames = frames_text([frame for group in lost for frame in range(group.first, group.first + group.frames)])
         report.append(f"{video.path.name} is cut off: {frames} cannot be shown; fetch the rest of it.")
-    movie = _load_movie(video, bool(whole))
+    movie = _load_movie(video)
     created = _create(context, name, columns, reel, shading)
     set_timeline(created, timeline)
     modifier = modifier_of(created)
@@ -87,8 +88,7 @@ def set_rung(played: bpy.types.Object, reel: VideoReel, rung: int | str | None =
     if modifier.node_group != field_reel(reel, reel.shade()):
         raise HoloreelError(f"{reel.path} is of another training than object '{played.name}': import it anew.")
     chosen, _ = _available_rung(reel, rung)
-    video = reel.video(chosen)
-    movie = _load_movie(video, not video.missing())
+    movie = _load_movie(reel.video(chosen))
     set_input(modifier, "Movie", movie)
     info = dict(played.get(INFO, {}))
     played[INFO] = {**info, "source": str(reel.path), "rung": rung_name(reel.rungs[chosen])}
@@ -167,15 +167,22 @@ def _available_rung(reel: VideoReel, wanted: int | str | None) -> tuple[int, lis
     raise HoloreelError(f"{reel.path}: its movie '{reel.rungs[best].file}' is missing; put it beside the reel.")
 
 
-def _load_movie(video: FeatureVideo, check: bool) -> bpy.types.Image:
-    """Return the image data-block of a movie. With `check`, its first picture must be the one that was encoded."""
-    try:
-        movie = bpy.data.images.load(str(video.path), check_existing=True)
-    except RuntimeError as error:
-        raise HoloreelError(f"{video.path} cannot be opened as a movie ({error}): fetch it again.") from error
-    movie.colorspace_settings.name = "Non-Color"
-    movie.alpha_mode = "NONE"
-    if check and (tuple(movie.size[::-1]) != video.picture or _first_crc(movie) != video.video.groups[0].luma_crc32):
+def _load_movie(video: FeatureVideo) -> bpy.types.Image:
+    """Return the image data-block of a movie, one for all objects that play it.
+
+    Its first picture must be the one that was encoded.
+    """
+    movie = next((image for image in bpy.data.images if _is_movie(image, video.path)), None)
+    if movie is not None:
+        movie.reload()  # the file may have come back, or be another one by now
+    else:
+        try:
+            movie = bpy.data.images.load(str(video.path))
+        except RuntimeError as error:
+            raise HoloreelError(f"{video.path} cannot be opened as a movie ({error}): fetch it again.") from error
+        movie.colorspace_settings.name = NON_COLOR
+        movie.alpha_mode = "NONE"
+    if _first_crc(movie, video.picture) != video.video.groups[0].luma_crc32:
         if movie.users == 0:
             bpy.data.images.remove(movie)
         raise HoloreelError(
@@ -185,8 +192,16 @@ def _load_movie(video: FeatureVideo, check: bool) -> bpy.types.Image:
     return movie
 
 
-def _first_crc(movie: bpy.types.Image) -> int:
+def _is_movie(image: bpy.types.Image, path: Path) -> bool:
+    same = Path(bpy.path.abspath(image.filepath, library=image.library)) == path
+    return same and image.library is None and image.colorspace_settings.name == NON_COLOR
+
+
+def _first_crc(movie: bpy.types.Image, picture: tuple[int, int]) -> int | None:
+    """Return the CRC-32 of the first picture's luma; None where it is not `picture` (height, width) large."""
     width, height = movie.size
+    if (height, width) != picture:
+        return None
     pixels = np.empty(height * width * 4, np.float32)
     movie.pixels.foreach_get(pixels)
     red = pixels.reshape(height, width, 4)[::-1, :, 0]

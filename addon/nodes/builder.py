@@ -490,8 +490,10 @@ class Tree:
             return depth[name]
 
         rows: dict[int, int] = defaultdict(int)
+        places: list[float] = []
         for node in self.tree.nodes:
             x = column(node.name)
-            node.location = (x * COLUMN_WIDTH, -rows[x] * ROW_HEIGHT)
+            places += x * COLUMN_WIDTH, -rows[x] * ROW_HEIGHT
             rows[x] += 1
+        self.tree.nodes.foreach_set("location", places)  # one by one, every node would update the whole tree
         return self

@@ -77,5 +77,6 @@ def _constant(tree: Tree, weights: NDArray[np.float32], shift: NDArray[np.float3
     columns = [*weights.T, np.zeros(WIDTH) if shift is None else shift]
     for column, values in enumerate(columns, start=1):
         for row, value in enumerate(values.tolist(), start=1):
-            node.inputs[f"Column {column} Row {row}"].default_value = value
+            if value != (column == row):  # what the node has by itself; setting a socket updates the whole tree
+                node.inputs[f"Column {column} Row {row}"].default_value = value
     return Matrix(tree, node.outputs[0])

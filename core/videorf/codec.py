@@ -325,8 +325,10 @@ class FeatureVideo:
 
     def _suspicion(self) -> str:
         """Say what became of a file whose bytes are not the right ones, as far as that can be told."""
-        import av
-
+        try:
+            import av
+        except ImportError:  # Blender's Python has no PyAV
+            return ": it was damaged, cut, or encoded again"
         try:
             with av.open(str(self.path)) as container:
                 frame = next(container.decode(video=0))
