@@ -5,7 +5,7 @@ Attributes with the prefix `stg_` are what the node group "Holoreel Evaluate" co
 Quaternions travel as FLOAT_COLOR, because nodes can calculate with a color's four numbers but not with a rotation's.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from enum import Enum
 
@@ -81,15 +81,28 @@ TABLE = (
 )
 
 
-def write(cloud: bpy.types.PointCloud, gaussians: SpacetimeGaussians) -> None:
-    """Write the whole table into a point cloud that has as many points as there are Gaussians."""
+# What points of several segments have besides, in reel frames counted from 0: see the node group "Holoreel Segment".
+SEGMENT_NAMES = ("stg_first", "stg_frames", "stg_until")
+
+
+def write(
+    cloud: bpy.types.PointCloud,
+    gaussians: SpacetimeGaussians,
+    segments: Mapping[str, NDArray[np.float32]] | None = None,
+) -> None:
+    """Write the whole table into a point cloud that has as many points as there are Gaussians.
+
+    `segments` has a column (N,) for each of `SEGMENT_NAMES`; without it all points belong to one segment.
+    """
+    columns = {name: (Kind.FLOAT, lambda values=values: values) for name, values in (segments or {}).items()}
+    columns |= {row.name: (row.kind, lambda row=row: row.read(gaussians)) for row in TABLE}
     # All are created before any is filled: creating one may move the others.
-    for row in TABLE:
-        if row.name not in cloud.attributes:
-            cloud.attributes.new(row.name, row.kind.type_name, "POINT")
-    for row in TABLE:
-        values = np.ascontiguousarray(row.read(gaussians), dtype=np.float32)
-        cloud.attributes[row.name].data.foreach_set(row.kind.property_name, values.ravel())
+    for name, (kind, _) in columns.items():
+        if name not in cloud.attributes:
+            cloud.attributes.new(name, kind.type_name, "POINT")
+    for name, (kind, values_of) in columns.items():
+        values = np.ascontiguousarray(values_of(), dtype=np.float32)
+        cloud.attributes[name].data.foreach_set(kind.property_name, values.ravel())
 
 
 def read(attributes: bpy.types.AttributeGroupPointCloud, name: str) -> NDArray[np.float32]:

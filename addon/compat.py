@@ -26,6 +26,12 @@ def input_identifier(group: bpy.types.NodeTree, name: str) -> str:
     raise KeyError(name)
 
 
+def input_names(group: bpy.types.NodeTree) -> set[str]:
+    """Return the names of the group's inputs."""
+    items = group.interface.items_tree
+    return {item.name for item in items if item.item_type == "SOCKET" and item.in_out == "INPUT"}
+
+
 def _menu_values(modifier: bpy.types.NodesModifier, identifier: str) -> dict[str, int]:
     items = modifier.id_properties_ui(identifier).as_dict().get("items") or ()
     return {item[0]: item[4] for item in items}

@@ -2,25 +2,28 @@
 """Reels as Blender objects: a point cloud with a model's parameters, and a modifier that plays it."""
 
 import math
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol
+from typing import Any, Protocol, TypeAlias
 
 import bpy
 from mathutils import Matrix
 
 from ..core.errors import HoloreelError
-from ..core.gaussians.flat import flattened
 from ..core.gaussians.model import SpacetimeGaussians
-from ..core.reel import VIDEORF, Loaded, load_gaussians, reel_kind
-from . import attributes
-from .compat import get_input, input_path, new_point_cloud, set_input
+from ..core.reel import VIDEORF, Loaded, load_segments, reel_kind
+from ..core.videorf.package import VideoReel, read_video_reel
+from . import clouds
+from .compat import get_input, input_names, input_path, set_input
 from .nodes.library import is_tagged
 from .nodes.reel import NAME, reel
 from .timeline import Timeline
 
 MODIFIER = "Holoreel"
 FIELD_NAME = "Holoreel Field Reel"  # the group of a VideoRF, as `NAME` is that of Spacetime Gaussians
-INFO = "holoreel"  # custom property of a reel's object: source, kind, fps, frame_count, gaussians, report
+INFO = "holoreel"  # custom property of a reel's object: source, kind, fps, frame_count, gaussians or points, report
 
 FRAME_BY_FRAME, REAL_TIME = "FRAMES", "REAL_TIME"
 
@@ -49,8 +52,19 @@ UPRIGHT = {
 }
 
 
+Read: TypeAlias = list[Loaded] | VideoReel
+
+
 class Clip(Protocol):
     """What the timeline asks of a reel of either kind."""
+
+    @property
+    def path(self) -> Path:
+        """Its file."""
+
+    @property
+    def frame_start(self) -> int:
+        """The number of its first frame."""
 
     @property
     def fps(self) -> float:
@@ -61,107 +75,144 @@ class Clip(Protocol):
         """How many frames there are."""
 
 
-def import_reel(
-    context: bpy.types.Context,
-    path: str | Path,
-    *,
-    start: float | None = None,
-    pace: str = FRAME_BY_FRAME,
-    up: str | None = None,
-    set_scene_timing: bool = False,
-) -> bpy.types.Object:
-    """Read a `.reel`, `.ply`, `.stgc` or `.splatv` and return the object that plays it; see `add_reel`.
-
-    Raises `HoloreelError` for a missing, damaged or unknown file; then nothing is added.
-    """
-    if reel_kind(path) == VIDEORF:
-        return _add_field_reel(context, Path(path), start, pace, up, set_scene_timing)
-    return add_reel(context, load_gaussians(path), start=start, pace=pace, up=up, set_scene_timing=set_scene_timing)
-
-
-def add_reel(
-    context: bpy.types.Context,
-    loaded: Loaded,
-    *,
-    start: float | None = None,
-    pace: str = FRAME_BY_FRAME,
-    up: str | None = None,
-    set_scene_timing: bool = False,
-) -> bpy.types.Object:
-    """Return a new object that plays what was loaded.
+@dataclass(frozen=True)
+class Options:
+    """How a reel is imported.
 
     `start` is the scene frame of the reel's first frame: None takes the reel's own `frame_start`, and the scene's first
     frame for files without one. `pace` FRAMES shows one reel frame per scene frame, REAL_TIME keeps the reel's speed
     whatever the scene's rate. `up` is the file's axis that shall point up (a key of `UPRIGHT`), or `FROM_FILE` for the
-    one that the file says; None turns nothing. `set_scene_timing` sets the scene's frame range and rate to the reel's;
-    otherwise the scene stays as it is.
+    one that the file says; None turns nothing. `scale` multiplies sizes. `set_scene_timing` sets the scene's frame
+    range and rate to the reel's; otherwise the scene stays as it is. `detail` percent of the Gaussians are kept, the
+    most important ones; `beside` stores them beside the reel instead of in the .blend. `rung` is which movie a VideoRF
+    plays, as in `core.videorf.decode.find_rung`.
     """
-    scene = context.scene
+
+    start: float | None = None
+    pace: str = FRAME_BY_FRAME
+    up: str | None = None
+    scale: float = 1.0
+    set_scene_timing: bool = False
+    detail: float = 100.0
+    beside: bool = False
+    rung: int | str | None = None
+
+
+def import_reel(context: bpy.types.Context, path: str | Path, **options: Any) -> bpy.types.Object:
+    """Read a `.reel` of either kind, `.ply`, `.stgc` or `.splatv` and return the object that plays it.
+
+    `options` are the fields of `Options`. Raises `HoloreelError` for a missing, damaged or unknown file; then nothing
+    is added.
+    """
+    return add_reel(context, read(path), Options(**options))
+
+
+def read(path: str | Path) -> Read:
+    """Read a file, without adding anything: the segments of Spacetime Gaussians, or the reel of a VideoRF."""
+    if reel_kind(path) == VIDEORF:
+        return read_video_reel(path)
+    return load_segments(path)
+
+
+def add_reel(context: bpy.types.Context, found: Read, options: Options) -> bpy.types.Object:
+    """Return a new object that plays what `read` has found."""
+    clip: Clip = found if isinstance(found, VideoReel) else (found[0].reel or found[0])
+    start = options.start
     if start is None:
-        start = loaded.frame_start if loaded.kind == "reel" else scene.frame_start
-    timeline = _timeline(scene, loaded, start, pace, set_scene_timing)
-    shown = flattened(loaded.gaussians, loaded.decoder, loaded.viewpoint)
-    created = create_reel_object(context, loaded.path.stem, shown, timeline)
-    _turn(created, loaded.up, up)
-    created[INFO] = {
-        "source": str(loaded.path),
-        "kind": loaded.kind,
-        "fps": loaded.fps,
-        "frame_count": loaded.frame_count,
-        "gaussians": len(loaded.gaussians),
-        "report": "\n".join(report_of(loaded)),
-    }
+        start = clip.frame_start if clip.path.suffix.lower() == ".reel" else context.scene.frame_start
+    if options.set_scene_timing:
+        _set_scene_timing(context.scene, clip, start)
+    rate = context.scene.render.fps / context.scene.render.fps_base
+    timeline = Timeline(clip.frame_count, start, speed=clip.fps / rate if options.pace == REAL_TIME else 1.0)
+    if isinstance(found, VideoReel):
+        from .fields import add_field_reel  # which itself needs what is here
+
+        created = add_field_reel(context, found, timeline=timeline, name=clip.path.stem, rung=options.rung)
+    else:
+        created = _add_gaussians(context, found, timeline, options)
+    remember_source(created, clip.path)
+    if options.up is not None or options.scale != 1.0:
+        axis = "Z" if options.up is None else (found_up(found) or "Z") if options.up == FROM_FILE else options.up
+        created.matrix_world = UPRIGHT[axis] @ Matrix.Scale(options.scale, 4)
     return created
 
 
-def _add_field_reel(
-    context: bpy.types.Context, path: Path, start: float | None, pace: str, up: str | None, set_scene_timing: bool
+def found_up(found: Read) -> str | None:
+    """Return the axis that a file says points up, None where it does not say."""
+    return found.up if isinstance(found, VideoReel) else found[0].up
+
+
+def _add_gaussians(
+    context: bpy.types.Context, parts: list[Loaded], timeline: Timeline, options: Options
 ) -> bpy.types.Object:
-    from ..core.videorf.package import read_video_reel
-    from .fields import add_field_reel
-
-    reel = read_video_reel(path)
-    start = reel.frame_start if start is None else start
-    timeline = _timeline(context.scene, reel, start, pace, set_scene_timing)
-    created = add_field_reel(context, reel, timeline=timeline, name=path.stem)
-    _turn(created, reel.up, up)
+    path = parts[0].path
+    created = _create(context, path.stem, clouds.join(parts, options.detail), timeline)
+    created[INFO] = describe(parts, options.detail)
+    if options.beside:
+        try:
+            clouds.store_beside(created.data, clouds.library_path(path, options.detail))
+        except HoloreelError:
+            remove_reel(created)
+            raise
     return created
 
 
-def _timeline(scene: bpy.types.Scene, played: Clip, start: float, pace: str, set_scene_timing: bool) -> Timeline:
-    if set_scene_timing:
-        _set_scene_timing(scene, played, start)
-    rate = scene.render.fps / scene.render.fps_base
-    return Timeline(played.frame_count, start=start, speed=played.fps / rate if pace == REAL_TIME else 1.0)
+def describe(parts: Sequence[Loaded], detail: float) -> dict[str, Any]:
+    """Return what `INFO` holds of Spacetime Gaussians."""
+    clip = parts[0].reel or parts[0]
+    return {
+        "source": str(clip.path),
+        "kind": parts[0].kind,
+        "fps": clip.fps,
+        "frame_count": clip.frame_count,
+        "gaussians": sum(len(part.gaussians) for part in parts),
+        "segments": len(parts),
+        "detail": detail,
+        "report": "\n".join(report_of(parts)),
+    }
 
 
-def _turn(created: bpy.types.Object, up_in_file: str | None, up: str | None) -> None:
-    if up is not None:
-        created.matrix_world = UPRIGHT[(up_in_file or "Z") if up == FROM_FILE else up]
-
-
-def report_of(loaded: Loaded) -> list[str]:
-    """Say in sentences what was assumed, what is unusual, and what will not be shown."""
-    report = list(loaded.report)
-    if loaded.decoder is not None:
-        how = "of its base" if loaded.viewpoint is None else "decoded as seen from the reel's viewpoint"
+def report_of(parts: Sequence[Loaded]) -> list[str]:
+    """Say in sentences what was assumed, what is unusual, and what will not be shown; each once."""
+    report = [sentence for part in parts for sentence in part.report]
+    if parts[0].decoder is not None:
+        how = "of its base" if parts[0].viewpoint is None else "decoded as seen from the reel's viewpoint"
         report.append(f"A full model: each Gaussian shows one color, {how} (an approximation).")
-    if loaded.reel is not None and len(loaded.reel.segments) > 1:
-        report.append(f"The first of {len(loaded.reel.segments)} segments is shown.")
-    return report
+    return list(dict.fromkeys(report))
+
+
+def summary(played: bpy.types.Object) -> str:
+    """Say in a few words what an imported reel is."""
+    info = played[INFO]
+    amount = f"{info['gaussians']:,} Gaussians" if "gaussians" in info else f"{info.get('points', 0):,} points"
+    return f"{played.name}: {amount}, {info['frame_count']:,} frames at {info['fps']:g} per second"
 
 
 def create_reel_object(
     context: bpy.types.Context, name: str, gaussians: SpacetimeGaussians, timeline: Timeline
 ) -> bpy.types.Object:
-    """Return a new point cloud object that plays `gaussians` by `timeline`, in the context's collection."""
-    created = new_point_cloud(context, name, len(gaussians))
-    attributes.write(created.data, gaussians)
+    """Return a new point cloud object that plays `gaussians` by `timeline`, in the context's collection.
+
+    The points stay in the order of the rows: sort them by `core.gaussians.importance` if detail shall be reduced.
+    """
+    return _create(context, name, clouds.Points(gaussians), timeline)
+
+
+def _create(context: bpy.types.Context, name: str, points: clouds.Points, timeline: Timeline) -> bpy.types.Object:
+    created = clouds.new_cloud_object(context, name, points)
     modifier = created.modifiers.new(MODIFIER, "NODES")
     modifier.node_group = reel()
     set_timeline(created, timeline)
     follow_resolution(created)
     return created
+
+
+def remove_reel(played: bpy.types.Object) -> None:
+    """Remove a reel's object, and its points where nothing else uses them."""
+    points = played.data
+    bpy.data.objects.remove(played)
+    if points.users == 0:
+        bpy.data.pointclouds.remove(points)
 
 
 def modifier_of(candidate: bpy.types.Object | None) -> bpy.types.NodesModifier | None:
@@ -175,19 +226,35 @@ def modifier_of(candidate: bpy.types.Object | None) -> bpy.types.NodesModifier |
     return None
 
 
-def source_of(played: bpy.types.Object) -> Path:
-    """Return the file that a reel was imported from: where it was, or beside the .blend under the same name.
+def remember_source(played: bpy.types.Object, path: Path) -> None:
+    """Write down where a reel lies: by its full path, and relative to the .blend once that is saved."""
+    info = dict(played.get(INFO, {}))
+    info |= {"source": str(path.absolute()), "relative": ""}
+    if bpy.data.is_saved:
+        with suppress(ValueError):  # on another drive
+            info["relative"] = bpy.path.relpath(info["source"])
+    played[INFO] = info
 
-    A path beginning with // is relative to the .blend (the library, for a linked reel). Raises `HoloreelError` if the
-    file is nowhere there, or the object is no imported reel.
+
+def source_of(played: bpy.types.Object) -> Path:
+    """Return the file that a reel was imported from, wherever it is now.
+
+    It is sought relative to the .blend (the library, for a linked reel) as it lay when it was imported, at its full
+    path, and beside the .blend under the same name. Raises `HoloreelError` if it is in none of these places, or the
+    object is no imported reel.
     """
     info = played.get(INFO)
     if info is None or not info.get("source"):
         raise HoloreelError(f"object '{played.name}' was not imported from a reel: import one.")
-    source = str(info["source"])
+    source, relative = str(info["source"]), str(info.get("relative", ""))
     recorded = Path(bpy.path.abspath(source, library=played.library))
-    beside = Path(bpy.path.abspath("//", library=played.library) or ".", recorded.name)
-    for candidate in (recorded, beside):
+    candidates = [recorded]
+    folder = bpy.path.abspath("//", library=played.library)
+    if folder:
+        candidates.append(Path(folder, recorded.name.rpartition("\\")[2]))
+        if relative:
+            candidates.insert(0, Path(bpy.path.abspath(relative, library=played.library)))
+    for candidate in candidates:
         if candidate.is_file():
             return candidate
     raise HoloreelError(f"{recorded}, the reel of object '{played.name}', is not there: put it back, or relink it.")
@@ -202,8 +269,8 @@ def timeline_of(played: bpy.types.Object) -> Timeline:
     modifier = modifier_of(played)
     if modifier is None:
         raise HoloreelError(f"object '{played.name}' is no reel: choose one.")
-    values = {field: get_input(modifier, name) for field, name in TIMELINE_INPUTS.items()}
-    return Timeline(**values)
+    there = input_names(modifier.node_group)  # groups of older files have fewer
+    return Timeline(**{field: get_input(modifier, name) for field, name in TIMELINE_INPUTS.items() if name in there})
 
 
 def set_timeline(played: bpy.types.Object, timeline: Timeline) -> None:

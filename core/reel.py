@@ -174,6 +174,13 @@ def load_gaussians(path: str | Path, segment: int = 0, decoder_output: Activatio
     )
 
 
+def load_segments(path: str | Path) -> list[Loaded]:
+    """Load all segments of a `.reel`, or the one that a bare file is. Raises as `load_gaussians` does."""
+    first = load_gaussians(path)
+    count = 1 if first.reel is None else len(first.reel.segments)
+    return [first, *(load_gaussians(path, index) for index in range(1, count))]
+
+
 def _load_reel(path: Path, index: int) -> Loaded:
     reel = read_reel(path)
     if not 0 <= index < len(reel.segments):

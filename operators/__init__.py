@@ -17,8 +17,17 @@ def _modules() -> tuple[ModuleType, ...]:
         train,
     )
 
-    mine = (environment, train, synth, jobs)
-    return import_reel, reload_reel, setup_exact_render, add_crop_box, let_rays_through, *mine
+    return (
+        import_reel,
+        reload_reel,
+        setup_exact_render,
+        add_crop_box,
+        let_rays_through,
+        environment,
+        train,
+        synth,
+        jobs,
+    )
 
 
 def register() -> None:

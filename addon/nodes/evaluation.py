@@ -86,7 +86,7 @@ def segment(tree: Tree) -> None:
     first, segmented = tree.attribute("stg_first", "FLOAT"), tree.has_attribute("stg_first", "FLOAT")
     ended = ~frame.below(tree.attribute("stg_until", "FLOAT"))
     points = tree.delete_points(points, segmented & (frame.below(first) | ended))
-    own = (frame - first) / tree.attribute("stg_frames", "FLOAT")
+    own = ((frame - first) / tree.attribute("stg_frames", "FLOAT")).at_most(1.0)
     tree.output("Geometry", points, "Gaussians of the segment")
     tree.output("Time", tree.choose(segmented, own, now, "FLOAT"), "Time in the segment, from 0 to 1")
 

@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Which Gaussians matter most, so that the first few of a sorted model stand for all of it. Needs numpy only."""
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -18,10 +20,10 @@ def importance(gaussians: SpacetimeGaussians) -> NDArray[np.float64]:
     return sigmoid(gaussians.opacity_logits.astype(np.float64)) * radius * _time_alive(gaussians)
 
 
-def most_important_first(segments: list[SpacetimeGaussians]) -> list[NDArray[np.float64]]:
-    """Return for each segment its rows' places (N,) in one common order, from 0 (most important) to below 1.
+def most_important_first(segments: Sequence[SpacetimeGaussians]) -> NDArray[np.int64]:
+    """Return the order of the rows of all segments, one after the other, that puts the most important first.
 
-    Within a segment places follow `importance`; the segments take turns by their sizes, so that the first part of the
+    Within a segment that is by `importance`; the segments take turns by their sizes, so that the first part of the
     whole is the same part of each.
     """
     places = []
@@ -29,7 +31,7 @@ def most_important_first(segments: list[SpacetimeGaussians]) -> list[NDArray[np.
         place = np.empty(len(gaussians))
         place[np.argsort(-importance(gaussians), kind="stable")] = np.arange(len(gaussians)) / max(1, len(gaussians))
         places.append(place)
-    return places
+    return np.argsort(np.concatenate(places), kind="stable")
 
 
 def _time_alive(gaussians: SpacetimeGaussians) -> NDArray[np.float64]:

@@ -1,0 +1,115 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The point clouds of Spacetime Gaussians: all segments in one, the most important points first.
+
+A cloud lies in the .blend, or in a .blend of its own beside the reel, to which the scene's .blend links. Blender itself
+loads it then, wherever the scene is opened or rendered.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import bpy
+import numpy as np
+from numpy.typing import NDArray
+
+from ..core.errors import HoloreelError
+from ..core.files import atomic_path
+from ..core.gaussians.flat import flattened
+from ..core.gaussians.importance import most_important_first
+from ..core.gaussians.model import SpacetimeGaussians, concatenate
+from ..core.reel import Loaded
+from . import attributes
+from .compat import new_point_cloud
+
+ENDLESS = 1e9  # the last segment ends at this frame
+
+
+@dataclass(frozen=True)
+class Points:
+    """What one point cloud holds: lite Gaussians (N), and of several segments the columns of `SEGMENT_NAMES` (N,)."""
+
+    gaussians: SpacetimeGaussians
+    segments: dict[str, NDArray[np.float32]] | None = None
+
+
+def join(parts: Sequence[Loaded], detail: float = 100.0) -> Points:
+    """Return the points of all segments of a reel, the most important first; `detail` percent of them."""
+    models = [flattened(part.gaussians, part.decoder, part.viewpoint) for part in parts]
+    order = most_important_first(models)
+    order = order[: max(1, math.ceil(len(order) * detail / 100.0))]
+    if len(models) == 1:
+        return Points(models[0].take(order))
+    sizes = [len(model) for model in models]
+    segments = {name: np.repeat(values, sizes)[order].astype(np.float32) for name, values in _windows(parts).items()}
+    return Points(concatenate(models).take(order), segments)
+
+
+def _windows(parts: Sequence[Loaded]) -> dict[str, list[float]]:
+    """Return when each segment is shown, in reel frames counted from 0."""
+    first = [float(part.frame_start - parts[0].frame_start) for part in parts]
+    frames = [float(part.frame_count) for part in parts]
+    return dict(zip(attributes.SEGMENT_NAMES, (first, frames, [*first[1:], ENDLESS]), strict=True))
+
+
+def new_cloud_object(context: bpy.types.Context, name: str, points: Points) -> bpy.types.Object:
+    """Return a new point cloud object with these points, in the context's collection."""
+    created = new_point_cloud(context, name, len(points.gaussians))
+    attributes.write(created.data, points.gaussians, points.segments)
+    return created
+
+
+def replace_points(context: bpy.types.Context, old: bpy.types.PointCloud, points: Points) -> bpy.types.PointCloud:
+    """Return a new point cloud with these points, which takes the place of `old` in all objects that have it."""
+    carrier = new_cloud_object(context, old.name, points)
+    new = carrier.data
+    bpy.data.objects.remove(carrier)
+    return _replace(old, new)
+
+
+def library_path(source: Path, detail: float = 100.0) -> Path:
+    """Return where the points of a reel lie that are not in the .blend: beside it, as `walk.reel.blend`.
+
+    Of `detail` percent of them, as `walk.reel.25.blend`.
+    """
+    return source.with_name(f"{source.name}.blend" if detail >= 100.0 else f"{source.name}.{detail:g}.blend")
+
+
+def store_beside(cloud: bpy.types.PointCloud, path: Path) -> bpy.types.PointCloud:
+    """Write a local cloud into the .blend at `path` and link to it; return the linked one, which replaces it.
+
+    Raises `HoloreelError` if the file cannot be written.
+    """
+    with atomic_path(path) as temporary:
+        bpy.data.libraries.write(str(temporary), {cloud}, fake_user=True)
+    for library in bpy.data.libraries:
+        if Path(bpy.path.abspath(library.filepath)) == path:
+            library.reload()
+    with bpy.data.libraries.load(str(path), link=True, relative=bpy.data.is_saved) as (found, wanted):
+        wanted.pointclouds = found.pointclouds[:1]
+    return _replace(cloud, wanted.pointclouds[0])
+
+
+def store_inside(cloud: bpy.types.PointCloud) -> bpy.types.PointCloud:
+    """Copy a linked cloud into the .blend; return the local one, which replaces it. Raises where it is missing."""
+    problem = missing_library(cloud)
+    if problem is not None:
+        raise HoloreelError(f"{problem}: reload the reel.")
+    return cloud if cloud.library is None else cloud.make_local()
+
+
+def missing_library(cloud: bpy.types.PointCloud) -> str | None:
+    """Say which file is missing that a linked cloud should come from; None if all is well."""
+    if cloud.library is None or not cloud.is_missing:
+        return None
+    return f"{Path(bpy.path.abspath(cloud.library.filepath)).name} with the points is missing"
+
+
+def _replace(old: bpy.types.PointCloud, new: bpy.types.PointCloud) -> bpy.types.PointCloud:
+    name = old.name
+    old.user_remap(new)
+    bpy.data.pointclouds.remove(old)
+    if new.library is None:
+        new.name = name
+    return new
