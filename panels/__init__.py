@@ -5,9 +5,9 @@ from types import ModuleType
 
 
 def _modules() -> tuple[ModuleType, ...]:
-    from . import look, reel
+    from . import jobs, look, reel, synth, train
 
-    return reel, look
+    return reel, look, synth, train, jobs
 
 
 def register() -> None:
