@@ -204,7 +204,7 @@ def test_reloading_keeps_what_was_set(random_model: Model, tmp_path: Path) -> No
 
 @pytest.mark.usefixtures("registered")
 def test_points_beside_the_reel_come_back_with_the_file(random_model: Model, tmp_path: Path) -> None:
-    model = random_model(3000)
+    model = random_model(20_000)
     path = tmp_path / "a.reel"
     save_gaussians(path, model, fps=24, frame_start=1, frame_count=5)
     bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "scene.blend"))
@@ -212,7 +212,9 @@ def test_points_beside_the_reel_come_back_with_the_file(random_model: Model, tmp
     assert bpy.ops.holoreel.import_reel(filepath=str(path), beside=True) == {"FINISHED"}
     show_points(bpy.context.object)
     bpy.ops.wm.save_mainfile()
-    assert (tmp_path / "scene.blend").stat().st_size - empty < 200_000 < 3000 * 120
+    assert (
+        (tmp_path / "scene.blend").stat().st_size - empty < 2_000_000 < 20_000 * 120
+    )  # node groups are written, points are not
     bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "scene.blend"))
     seek(2)
     assert_shows(bpy.data.objects["a"], model.evaluate(0.2))
