@@ -10,8 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .capture import Capture
+from .capture.capture import Triple
 from .capture.images import composite
-from .capture.layouts import protocol_of
+from .capture.layouts import Protocol, protocol_of
 from .draw import Drawing, Player, open_player
 from .errors import HoloreelError
 from .gaussians.decoder import Activation
@@ -58,6 +59,7 @@ def evaluate_player(
     on_progress: OnProgress | None = None,
     on_picture: OnPicture | None = None,
     lpips: Sequence[Lpips] = (),
+    protocol: Protocol | None = None,
 ) -> dict[str, Any]:
     """Draw every picture of a split (`train`, `test` or `all`) and score it; return what `metrics.json` holds.
 
@@ -67,10 +69,16 @@ def evaluate_player(
     added, and what shows a subject alone is compared with it alone, over the reel's background.
 
     `on_progress(done, total)` is called after each picture, `on_picture(camera, frame, drawing)` with each drawing;
-    `frame` is the number on the timeline. `lpips` is as `core.lpips.load_lpips` returns it. Raises `HoloreelError`
-    where the split is empty, or the reel does not cover the capture's frames.
+    `frame` is the number on the timeline. `lpips` is as `core.lpips.load_lpips` returns it. A `protocol` says which of
+    the views to draw, and over what a subject alone is compared. Raises `HoloreelError` where the split is empty, or
+    the reel does not cover the capture's frames.
     """
     views = capture.views(None if split == "all" else split)
+    if protocol and protocol.views:
+        wanted = set(protocol.views(capture))
+        views = [view for view in views if view in wanted]
+    another = protocol.background if protocol and player.subject_alone else None
+    background = another or player.background
     if not views:
         raise HoloreelError(
             f"{capture.source} has no pictures in the split '{split}': name another with --split, "
@@ -80,8 +88,8 @@ def evaluate_player(
     rows: list[Measured] = []
     for name, index in views:
         frame = capture.frame_start + index
-        drawing = player.draw(capture.cameras[name], moments[index])
-        truth, mask = _truth(player, capture, name, index, masked)
+        drawing = player.draw(capture.cameras[name], moments[index], another)
+        truth, mask = _truth(player, capture, name, index, masked, background)
         rows.append(Measured(name, frame, _scores(player, capture, name, drawing, truth, mask, lpips)))
         if on_picture:
             on_picture(name, frame, drawing)
@@ -91,12 +99,12 @@ def evaluate_player(
     return {
         "version": VERSION,
         "reel": player.path.name,
-        "capture": capture.source.resolve().parent.name,
+        "capture": capture.name,
         "split": split,
         "backend": player.backend_name,
         **player.facts(),
         "precision": "float drawings, 8-bit truth",
-        **_protocol(player, capture, split),
+        **_protocol(player, capture, split, protocol, background),
         "size": sizes(player),
         **({"lpips_input": lpips[0].input_range} if lpips else {}),
         "mean": _mean(rows),
@@ -109,23 +117,30 @@ def evaluate_player(
 
 
 def _truth(
-    player: Player, capture: Capture, name: str, index: int, masked: bool
+    player: Player, capture: Capture, name: str, index: int, masked: bool, background: Triple
 ) -> tuple[NDArray[np.float32], NDArray[np.bool_] | None]:
     """Return the picture (H, W, 3) that should have been drawn, and where its subject is (H, W) if that is known."""
     rgba = capture.rgba(name, index) if masked else None
     if rgba is not None and player.subject_alone:
-        picture = composite(rgba, player.background)
+        picture = composite(rgba, background)
     else:
-        picture = capture.image(name, index, background=player.background)
+        picture = capture.image(name, index, background=background)
     return picture.astype(np.float32) / 255.0, None if rgba is None else rgba[..., 3] > 0
 
 
-def _protocol(player: Player, capture: Capture, split: str) -> dict[str, Any]:
-    """Return which dataset's protocol this is, if it is one: its name, cameras, measures and background."""
-    protocol = protocol_of(capture) if split == "test" and player.subject_alone else None
-    if protocol is None or protocol.background not in (None, tuple(player.background)):
+def _protocol(
+    player: Player, capture: Capture, split: str, asked: Protocol | None, background: Triple
+) -> dict[str, Any]:
+    """Return which dataset's protocol was kept, asked for or not, if any: its name, cameras, measures, background."""
+    kept = asked
+    if kept is None and split == "test" and player.subject_alone:
+        kept = protocol_of(capture)
+        if kept and (kept.views or kept.background not in (None, tuple(background))):
+            kept = None
+    if kept is None:
         return {}
-    return {"protocol": protocol._asdict() | {"held_out": capture.camera_names("test")}}
+    facts = {"name": kept.name, "measures": kept.measures, "background": kept.background}
+    return {"protocol": facts | {"held_out": capture.camera_names("test")}}
 
 
 def _scores(

@@ -36,6 +36,8 @@ def read_pixels(path: str | Path) -> NDArray[np.uint8] | NDArray[np.uint16]:
         pixels = iio.imread(path, plugin="pillow")
     except Exception as error:  # Pillow raises what it likes
         raise HoloreelError(f"{path} cannot be read as a picture ({_first_line(error)}): fetch it again.") from error
+    if pixels.dtype == np.bool_:  # one bit a pixel, as masks are at times
+        pixels = pixels.astype(np.uint8) * 255
     if pixels.dtype not in (np.uint8, np.uint16) or pixels.ndim not in (2, 3):
         raise HoloreelError(f"{path} has pixels of {pixels.dtype} {pixels.shape}: save it as an 8 or 16-bit picture.")
     pixels = np.atleast_3d(pixels)

@@ -166,7 +166,7 @@ def write_results(
         *(_section(f"Rungs of {row.variant.key}: {row.variant.title}", ladder(row)) for row in rows.values()),
     ]
     intro = (
-        f"Quality over bytes on {capture.source.resolve().parent.name}, {full.frames} frames, views held out. Decibels "
+        f"Quality over bytes on {capture.name}, {full.frames} frames, views held out. Decibels "
         "are those of the mean squared error of all pictures over white, or of the pixels of the masks alone; bytes "
         "are compared by BD-rate over the qualities that both curves reach."
     )

@@ -44,6 +44,7 @@ class Capture:
     matte: Triple | None = None  # the color (0 to 1) that pictures with masks lie over; None: they show what was there
     bounds: tuple[Triple, Triple] | None = None  # lower and upper corner of a box around the subject, all frames
     source: Path = Path("capture")  # the file it was read from, for messages
+    title: str = ""  # what it is called, where that is not the name of the folder of `source`
     notes: tuple[str, ...] = ()  # what its reader measured or assumed, in sentences
 
     def __post_init__(self) -> None:
@@ -69,6 +70,11 @@ class Capture:
         if self.bounds is not None and not _is_box(*self.bounds):
             return f"bounds must be a lower and an upper corner of finite numbers, not {self.bounds}"
         return ""
+
+    @property
+    def name(self) -> str:
+        """What the capture is called: in results, and in the titles of pages."""
+        return self.title or self.source.resolve().parent.name
 
     @property
     def times(self) -> NDArray[np.float64]:

@@ -13,7 +13,7 @@ from ..camera import Camera
 from ..errors import HoloreelError
 from .capture import Capture, View
 from .colmap_model import find_model, points_file, read_cameras, write_model
-from .export import Export, file_names, write_pictures
+from .export import Export, file_names, with_alpha, write_pictures
 from .media import Media
 from .options import CaptureOptions
 from .picture_set import check_pictures
@@ -94,7 +94,7 @@ def write(capture: Capture, path: Path, export: Export) -> None:
         return folders[frame] / "images" / files[name]
 
     lenses = export.lenses(capture)
-    write_pictures(capture, lenses, place, export, alpha=True)
+    write_pictures(capture, lenses, place, export, with_alpha)
     cameras = {files[name]: lenses[name] for name in files}
     for j, folder in enumerate(folders):
         write_model(folder / "sparse" / "0", cameras, capture.seed_points(j))

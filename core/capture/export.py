@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from fractions import Fraction
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,7 +24,10 @@ from .resample import LensMap, lens_map, same_lens
 Picture = NDArray[np.uint8]
 Content = Callable[[Capture, str, int], Picture]  # what is written of a view (camera, frame), before any lens
 _QUALITY = "10"  # x264's constant rate factor: the difference to the source is under the pictures' own noise
-_PNG_LEVEL = 3  # zlib's: twice as fast as the usual 6, a few percent larger
+_FORMATS: dict[str, dict[str, Any]] = {
+    ".png": {"compress_level": 3},  # zlib's: twice as fast as the usual 6, a few percent larger
+    ".jpg": {"quality": 98, "subsampling": 0},  # colors at full resolution
+}
 
 
 @dataclass
@@ -100,9 +104,25 @@ def subject_over(background: Triple) -> Content:
     return lambda capture, name, frame: composite(capture.rgba(name, frame), background)
 
 
+def subject_alpha(capture: Capture, name: str, frame: int) -> Picture:
+    """How much of each pixel the subject covers, (H, W, 1)."""
+    return capture.rgba(name, frame)[..., 3:]
+
+
 def subject_mask(capture: Capture, name: str, frame: int) -> Picture:
     """How much of each pixel the subject covers, as gray (H, W, 3)."""
-    return np.repeat(capture.rgba(name, frame)[..., 3:], 3, axis=2)
+    return np.repeat(subject_alpha(capture, name, frame), 3, axis=2)
+
+
+def check_complete(capture: Capture, cameras: Iterable[str], what: str) -> None:
+    """Raise `HoloreelError` naming the first picture that is not there of these cameras, for `what` needs all."""
+    lacking = [(name, j) for j in range(capture.frame_count) for name in cameras if (name, j) not in capture.images]
+    if lacking:
+        name, frame = lacking[0]
+        raise HoloreelError(
+            f"{capture.source}: camera {name!r} has no picture of frame {capture.frame_start + frame}, and {what} "
+            "needs all of them; take the frames that all cameras have by --frames."
+        )
 
 
 def write_pictures(
@@ -110,18 +130,20 @@ def write_pictures(
     targets: Mapping[str, Camera],
     place: Callable[[str, int], Path],
     export: Export,
-    alpha: bool = False,
+    content: Content | None = None,
 ) -> None:
-    """Write every view as the PNG `place(camera, frame)`, seen through the lens of its camera in `targets`."""
+    """Write every view as the PNG or JPEG `place(camera, frame)`, seen through the lens of its camera in `targets`.
+
+    `content` is what is shown, without it the pictures over the export's background.
+    """
     _note_lenses(capture, targets, export)
     views = [(name, j) for name in targets for j in range(capture.frame_count) if (name, j) in capture.images]
-    content = with_alpha if alpha else over(export.background)
     lens = _Lenses(capture, targets)
     for done, (name, frame) in enumerate(views):
         export.show(done, len(views))
         path = place(name, frame)
         if not path.is_file():
-            _write_png(path, lens.picture(name, frame, content))
+            _write_picture(path, lens.picture(name, frame, content or over(export.background)))
     export.show(len(views), len(views))
 
 
@@ -139,12 +161,7 @@ def write_videos(
     the gray `unseen`.
     """
     _note_lenses(capture, targets, export)
-    lacking = [(name, j) for j in range(capture.frame_count) for name in targets if (name, j) not in capture.images]
-    if lacking:
-        raise HoloreelError(
-            f"{capture.source}: camera {lacking[0][0]!r} has no picture of frame {lacking[0][1]}, and a video needs "
-            "all of them; take the frames that all cameras have by --frames."
-        )
+    check_complete(capture, targets, "a video")
     total = len(targets) * capture.frame_count
     lens = _Lenses(capture, targets)
 
@@ -209,8 +226,10 @@ def _note_lenses(capture: Capture, targets: Mapping[str, Camera], export: Export
         export.notes.append(note)
 
 
-def _write_png(path: Path, picture: Picture) -> None:
+def _write_picture(path: Path, picture: Picture) -> None:
+    """Write (H, W, 1, 3 or 4) in the format that the path's suffix says."""
     import imageio.v3 as iio
 
+    pixels = picture[..., 0] if picture.shape[2] == 1 else picture
     with atomic_path(path) as temporary:
-        iio.imwrite(temporary, picture, plugin="pillow", extension=".png", compress_level=_PNG_LEVEL)
+        iio.imwrite(temporary, pixels, plugin="pillow", extension=path.suffix, **_FORMATS[path.suffix])

@@ -8,9 +8,9 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from ..errors import HoloreelError
-from . import colmap, immersive, n3v, nerfstudio, rerf, sfm_result, technicolor, videos
+from . import actorshq, colmap, immersive, n3v, nerfstudio, rerf, sfm_result, technicolor, videos
 from .capture import Capture, Triple, View
-from .export import Export, file_names, write_pictures
+from .export import Export, file_names, with_alpha, write_pictures
 from .media import Media
 from .options import CaptureOptions
 from .points import write_points
@@ -22,6 +22,7 @@ class Protocol(NamedTuple):
     name: str
     measures: tuple[str, ...]  # of `core.evaluate`
     background: Triple | None = None  # that subject and drawing lie over; None: it does not matter
+    views: Callable[[Capture], list[View]] | None = None  # what is looked at; None: all of the held-out cameras
 
 
 @dataclass(frozen=True)
@@ -54,7 +55,7 @@ def _write_nerfstudio(capture: Capture, path: Path, export: Export) -> None:
         return path / "images" / names[name] / f"{capture.frame_start + frame:06d}.png"
 
     lenses = export.lenses(capture)
-    write_pictures(capture, lenses, place, export, alpha=True)
+    write_pictures(capture, lenses, place, export, with_alpha)
     seeds = {j: path / "points" / f"{capture.frame_start + j:06d}.ply" for j in capture.seeds}
     for frame, file in seeds.items():
         write_points(file, capture.seed_points(frame))
@@ -107,6 +108,15 @@ LAYOUTS = {
         held_out=rerf.HELD_OUT,
         protocol=Protocol("ReRF", ("psnr", "ssim_gauss"), rerf.WHITE),
         names=rerf.names,
+    ),
+    "actorshq": Layout(
+        "calibration.csv, rgbs and masks, or folders 1x, 2x, 4x with them",
+        actorshq.matches,
+        actorshq.read,
+        actorshq.write,
+        held_out=actorshq.HELD_OUT,
+        protocol=Protocol("HumanRF", ("psnr_mask", "ssim_crop"), actorshq.BLACK, actorshq.protocol_views),
+        names=actorshq.names,
     ),
     "videos": Layout("a video per camera", videos.matches, videos.read, videos.write),
 }
@@ -198,6 +208,21 @@ def protocol_of(capture: Capture) -> Protocol | None:
     held_out = set(capture.camera_names("test"))
     found = (row.protocol for row in LAYOUTS.values() if row.protocol and held_out == set(row.held_out or ()))
     return next(found, None)
+
+
+def named_protocol(name: str, capture: Capture) -> Protocol:
+    """Return the protocol of a name in lower case; `HoloreelError` where a capture holds out other cameras than it."""
+    layout = next(row for row in LAYOUTS.values() if row.protocol and row.protocol.name.lower() == name)
+    wanted, held_out = list(layout.held_out or ()), capture.camera_names("test")
+    assert layout.protocol is not None
+    if set(wanted) != set(held_out):
+        lacking = [camera for camera in wanted if camera not in capture.cameras]
+        remedy = f"it has no {lacking[0]}" if lacking else f"read it with --test-cameras {' '.join(wanted)}"
+        raise HoloreelError(
+            f"{capture.source}: --protocol {name} holds {', '.join(wanted)} out, here it is "
+            f"{', '.join(held_out) or 'none'}; {remedy}."
+        )
+    return layout.protocol
 
 
 def default_held_out(layout: Layout, names: Sequence[str]) -> list[str]:

@@ -9,7 +9,7 @@ from typing import Literal
 
 from ..errors import HoloreelError
 
-LayoutName = Literal["auto", "nerfstudio", "n3v", "technicolor", "immersive", "colmap", "rerf", "videos"]
+LayoutName = Literal["auto", "nerfstudio", "n3v", "technicolor", "immersive", "colmap", "rerf", "actorshq", "videos"]
 
 
 @dataclass(frozen=True)

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Matching the frames of several cameras to one clock, from the moment each frame was taken."""
 
-import csv
-import io
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -13,6 +11,7 @@ from numpy.typing import NDArray
 
 from ..errors import HoloreelError
 from .capture import MAX_FRAMES
+from .tables import read_table
 
 FILE_NAME = "timestamps.csv"
 COLUMNS = ("cam_id", "frame_time")
@@ -95,27 +94,18 @@ def _nearest(moments: NDArray[np.float64], ticks: NDArray[np.float64]) -> NDArra
 
 def read_timestamps(file: Path) -> dict[str, NDArray[np.float64]]:
     """Read the columns cam_id and frame_time (seconds) of a CSV: by camera, the moments of its frames in order."""
-    try:
-        if file.stat().st_size > _MAX_BYTES:
-            raise HoloreelError(f"{file} is larger than {_MAX_BYTES >> 20} MiB: these are no timestamps.")
-        rows = csv.DictReader(io.StringIO(file.read_text(encoding="utf-8-sig", errors="replace")))
-        columns = rows.fieldnames or []
-        table = list(rows)
-    except (OSError, csv.Error) as error:
-        raise HoloreelError(f"{file} cannot be read ({error}): write it again.") from error
-    if missing := [name for name in COLUMNS if name not in columns]:
-        raise HoloreelError(f"{file} has no column {missing[0]} (it has {', '.join(columns)[:60] or 'none'}); add it.")
+    table = read_table(file, COLUMNS, _MAX_BYTES)
     times: dict[str, list[float]] = {}
     for number, row in enumerate(table, start=2):
         try:
             moment = float(row["frame_time"])
             if not abs(moment) < _MAX_TIME_S:
                 raise ValueError("not a time in seconds")
-        except (TypeError, ValueError) as error:
+        except ValueError as error:
             raise HoloreelError(
                 f"{file}: line {number}: frame_time {row['frame_time']!r} is no number of seconds."
             ) from error
-        times.setdefault(str(row["cam_id"]).strip(), []).append(moment)
+        times.setdefault(row["cam_id"], []).append(moment)
     for name, moments in times.items():
         if len(moments) < 2 or not (np.diff(moments) > 0).all():
             raise HoloreelError(f"{file}: frame_time of camera {name} must increase over two or more frames.")

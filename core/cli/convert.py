@@ -18,7 +18,7 @@ def run(
     capture: tyro.conf.Positional[Path],
     /,
     out: Path,
-    to: Literal["nerfstudio", "colmap", "n3v", "technicolor", "immersive", "rerf", "videos"],
+    to: Literal["nerfstudio", "colmap", "n3v", "technicolor", "immersive", "rerf", "actorshq", "videos"],
     background: tuple[float, float, float] = (0.0, 0.0, 0.0),
     rectify: float | None = None,
     options: Annotated[CaptureOptions, tyro.conf.arg(name="")] = CaptureOptions(),  # noqa: B008

@@ -9,6 +9,7 @@ import tyro
 from tqdm import tqdm
 
 from ..capture import CaptureOptions, read_capture
+from ..capture.layouts import named_protocol
 from ..draw import Drawing, Quality, open_player
 from ..errors import HoloreelError
 from ..evaluate import evaluate_player
@@ -27,6 +28,7 @@ def run(
     capture: tyro.conf.Positional[Path],
     /,
     split: Literal["test", "train", "all"] = "test",
+    protocol: Literal["rerf", "humanrf"] | None = None,
     out: Path | None = None,
     pictures: bool = True,
     speed: bool = False,
@@ -48,6 +50,8 @@ def run(
         file: the .reel, .ply, .stgc or .splatv, or the NAME.model of a VideoRF.
         capture: folder of a capture in any layout that `holoreel info` knows.
         split: which cameras of the capture.
+        protocol: look at what this dataset's evaluation looks at, subjects over its background: rerf all frames of its
+            held-out cameras over white, humanrf a third and a fifth of them over black.
         out: folder for metrics.json, a page index.html and the drawn pictures (OUT/CAMERA/FRAME.png).
         pictures: write the drawn pictures too.
         speed: measure frames per second too, by the authors' protocol and by ours.
@@ -62,6 +66,9 @@ def run(
         options: how the capture is read.
     """
     recording = read_capture(capture, options)
+    if protocol and split != "test":
+        raise HoloreelError(f"--protocol {protocol} looks at held-out cameras: leave --split {split} out.")
+    rules = named_protocol(protocol, recording) if protocol else None
     player = open_player(file, backend, decoder_output=decoder_output, rung=rung, quality=quality)
     for sentence in player.report:
         print(f"note: {sentence}", file=sys.stderr)
@@ -77,7 +84,7 @@ def run(
             bar.total = total
             bar.update(done - bar.n)
 
-        metrics = evaluate_player(player, recording, split, show, keep, measures)
+        metrics = evaluate_player(player, recording, split, show, keep, measures, rules)
     if speed:
         from ..bench.play import measure_play
 

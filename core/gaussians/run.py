@@ -230,7 +230,7 @@ def _gaussians(tensors: Mapping[str, torch.Tensor]) -> SpacetimeGaussians:
 
 
 def _write_result(capture: Capture, config: TrainConfig, finished: list[_Finished], paths: RunPaths) -> Reel:
-    name = capture.source.resolve().parent.name
+    name = capture.name
     write_json(paths.record, _record(capture, config, finished, name))
     return write_segments(
         paths.reel,

@@ -471,7 +471,7 @@ def _identity(capture: Capture) -> dict[str, Any]:
 
 
 def _name(capture: Capture) -> str:
-    return capture.source.resolve().parent.name
+    return capture.name
 
 
 def _read_occupancy(path: Path, shape: tuple[int, int, int]) -> Occupancy:
