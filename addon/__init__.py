@@ -6,9 +6,9 @@ from types import ModuleType
 
 def _modules() -> tuple[ModuleType, ...]:
     from .. import operators, panels
-    from . import checkup, commands, jobs, preferences, previews, synthesis, training
+    from . import checkup, commands, jobs, preferences, previews, synthesis, training, viewport
 
-    return preferences, checkup, previews, training, synthesis, jobs, commands, operators, panels
+    return preferences, checkup, previews, training, synthesis, jobs, viewport, commands, operators, panels
 
 
 def register() -> None:

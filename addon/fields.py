@@ -5,6 +5,7 @@ The points say where each vertex lies, in the world and in the movie; the modifi
 where it lies. The .blend holds the points, never the movie.
 """
 
+import os
 import zlib
 from pathlib import Path
 
@@ -20,9 +21,10 @@ from ..core.videorf.package import VideoReel
 from ..core.videorf.shading import Shading
 from .attributes import Kind
 from .compat import get_input, new_point_cloud, set_input
+from .nodes.decoder import fits
 from .nodes.field import FIRST, LAST, NAME, POINT_SIZE, UV, field_reel
 from .nodes.library import is_tagged
-from .reels import INFO, MODIFIER, follow_resolution, modifier_of, set_timeline
+from .reels import INFO, MODIFIER, follow_scene, modifier_of, set_timeline
 from .timeline import Timeline
 
 NON_COLOR = "Non-Color"
@@ -62,7 +64,12 @@ def add_field_reel(
     modifier = modifier_of(created)
     set_input(modifier, "Point Size", POINT_SIZE)
     set_input(modifier, "Movie", movie)
-    follow_resolution(created)
+    follow_scene(created)
+    if not fits(shading.shape):
+        report.append(
+            f"The network has {shading.shape.hidden} hidden units, too many for nodes: colors are only a hint here, "
+            "the Holoreel engine draws the true ones."
+        )
     report.append(f"The features stay in {video.path.name}: keep it where it is, or beside the reel.")
     created[INFO] = {
         "source": str(reel.path),
@@ -172,33 +179,37 @@ def _load_movie(video: FeatureVideo) -> bpy.types.Image:
 
     Its first picture must be the one that was encoded.
     """
-    movie = next((image for image in bpy.data.images if _is_movie(image, video.path)), None)
-    if movie is not None:
-        movie.reload()  # the file may have come back, or be another one by now
-    else:
-        try:
-            movie = bpy.data.images.load(str(video.path))
-        except RuntimeError as error:
-            raise HoloreelError(f"{video.path} cannot be opened as a movie ({error}): fetch it again.") from error
-        movie.colorspace_settings.name = NON_COLOR
-        movie.alpha_mode = "NONE"
-    if _first_crc(movie, video.picture) != video.video.groups[0].luma_crc32:
-        if movie.users == 0:
-            bpy.data.images.remove(movie)
+    try:
+        fresh = bpy.data.images.load(str(video.path))
+    except RuntimeError as error:
+        raise HoloreelError(f"{video.path} cannot be opened as a movie ({error}): fetch it again.") from error
+    fresh.colorspace_settings.name = NON_COLOR
+    fresh.alpha_mode = "NONE"
+    same = _first_crc(fresh, video.picture) == video.video.groups[0].luma_crc32
+    held = next((image for image in bpy.data.images if image != fresh and _is_movie(image, video.path)), None)
+    if held is not None or not same:
+        bpy.data.images.remove(fresh)
+    if not same:
         raise HoloreelError(
             f"Blender decodes {video.path} to other values than were encoded: take a rung of another codec, or fetch "
             f"the original file."
         )
-    return movie
+    if held is None:
+        return fresh
+    held.reload()  # the file may have come back, or be another one by now
+    return held
 
 
 def _is_movie(image: bpy.types.Image, path: Path) -> bool:
-    same = Path(bpy.path.abspath(image.filepath, library=image.library)) == path
+    same = os.path.realpath(bpy.path.abspath(image.filepath, library=image.library)) == os.path.realpath(path)
     return same and image.library is None and image.colorspace_settings.name == NON_COLOR
 
 
 def _first_crc(movie: bpy.types.Image, picture: tuple[int, int]) -> int | None:
-    """Return the CRC-32 of the first picture's luma; None where it is not `picture` (height, width) large."""
+    """Return the CRC-32 of the first picture's luma; None where it is not `picture` (height, width) large.
+
+    The data-block must be new: one that was played gives the picture that it showed last.
+    """
     width, height = movie.size
     if (height, width) != picture:
         return None

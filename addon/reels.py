@@ -25,6 +25,16 @@ MODIFIER = "Holoreel"
 FIELD_NAME = "Holoreel Field Reel"  # the group of a VideoRF, as `NAME` is that of Spacetime Gaussians
 INFO = "holoreel"  # custom property of a reel's object: source, kind, fps, frame_count, gaussians or points, report
 
+# Inputs of a look that follow the scene: a driver's expression and its variables. Blender numbers its render engines;
+# Workbench is the second of those that it brings along.
+_FOLLOWED = {
+    f"Render {side}": (
+        "floor(pixels * percent / 100)",
+        {"pixels": f"render.resolution_{axis}", "percent": "render.resolution_percentage"},
+    )
+    for side, axis in (("Width", "x"), ("Height", "y"))
+} | {"Workbench": ("engine == 1", {"engine": "render.engine"})}
+
 FRAME_BY_FRAME, REAL_TIME = "FRAMES", "REAL_TIME"
 
 # The fields of `Timeline` and the modifier's inputs.
@@ -203,7 +213,7 @@ def _create(context: bpy.types.Context, name: str, points: clouds.Points, timeli
     modifier = created.modifiers.new(MODIFIER, "NODES")
     modifier.node_group = reel()
     set_timeline(created, timeline)
-    follow_resolution(created)
+    follow_scene(created)
     return created
 
 
@@ -288,17 +298,16 @@ def _set_scene_timing(scene: bpy.types.Scene, played: Clip, start: float) -> Non
     scene.frame_end = math.ceil(start) + played.frame_count - 1
 
 
-def follow_resolution(played: bpy.types.Object) -> None:
-    """Drive the look's picture size by the resolution of whatever scene the reel is in."""
+def follow_scene(played: bpy.types.Object) -> None:
+    """Drive what a look has to know of whatever scene the reel is in: the picture's size, and the render engine."""
     modifier = modifier_of(played)
-    sources = {"percent": "render.resolution_percentage"}
-    for name, side in (("Render Width", "x"), ("Render Height", "y")):
+    for name, (expression, paths) in _FOLLOWED.items():
         driver = played.driver_add(input_path(modifier, name)).driver
         driver.type = "SCRIPTED"
-        for variable_name, path in {**sources, "pixels": f"render.resolution_{side}"}.items():
+        for variable_name, path in paths.items():
             variable = driver.variables.new()
             variable.name = variable_name
             variable.type = "CONTEXT_PROP"
             variable.targets[0].context_property = "ACTIVE_SCENE"
             variable.targets[0].data_path = path
-        driver.expression = "floor(pixels * percent / 100)"
+        driver.expression = expression

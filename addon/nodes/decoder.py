@@ -7,12 +7,20 @@ import bpy
 import numpy as np
 from numpy.typing import NDArray
 
-from ...core.videorf.shading import Shading, shading_bytes
+from ...core.videorf.shading import Shading, ShadingShape, shading_bytes
 from .builder import Float, Matrix, Tree, Vector
 from .library import ensure_group
 
 NAME, VERSION = "Holoreel Field Colors", 1
 WIDTH = 3  # numbers that a vector carries
+PRODUCTS_MAX = 250  # of a group: Blender takes 2 s to build as many, and a minute for a thousand
+
+
+def fits(shape: ShadingShape) -> bool:
+    """Return whether a network is small enough for nodes; the default of training needs 72 products."""
+    blocks = -(-shape.features // WIDTH) + shape.direction_inputs // WIDTH
+    units = -(-shape.hidden // WIDTH)
+    return units * (blocks + units + 1) <= PRODUCTS_MAX
 
 
 def feature_sockets(features: int) -> list[str]:

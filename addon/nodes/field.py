@@ -7,19 +7,19 @@ Geometry Nodes read the movie as it lies on the disk: Closest, by pixel, so that
 from typing import Any
 
 import bpy
+import numpy as np
 
 from ...core.videorf.occupancy import GAMMA
 from ...core.videorf.package import VideoReel
 from ...core.videorf.shading import Shading
 from .. import timeline
 from ..compat import set_wildcard
-from .builder import Boolean, Float, Geometry, Image, Object, Tree, Value, Vector
-from .decoder import WIDTH, decoder, feature_sockets, sigmoid
+from .builder import Boolean, Float, Geometry, Image, Tree, Value, Vector
+from .decoder import WIDTH, decoder, feature_sockets, fits, sigmoid
 from .evaluation import time, timeline_inputs
 from .library import ensure_group
-from .looks import linear_color, points, points_inputs, splats, splats_inputs
-from .reel import COLOR_TOOLTIP, COLORS, DISPLAY, LINEAR, LOOK_PANEL, POINTS, SPLATS
-from .view import View, view_camera
+from .show import POINTS, set_show_defaults, show, show_inputs
+from .view import View
 
 NAME, VERSION = "Holoreel Field Reel", 1
 SAMPLE = "Holoreel Field Frame"
@@ -35,10 +35,6 @@ CAMERA, DIRECTION = "Camera", "Direction"
 VIEWS = {
     CAMERA: "Color each point as the active camera sees it",
     DIRECTION: "Color all points as seen along one direction, wherever the camera is",
-}
-LOOKS = {
-    POINTS: "Opaque points; fast, for any camera and render engine",
-    SPLATS: "Soft splats, one for each point, facing the active camera; nearer to what ray marching shows",
 }
 BROKEN = (1.0, 0.0, 1.0)  # the color that says: the movie is missing
 
@@ -70,8 +66,6 @@ def _version(reel: VideoReel) -> str:
 
 def _fill(tree: Tree, reel: VideoReel, shading: Shading) -> None:
     cloud = tree.geometry_input()
-    look = tree.menu_input("Look", "How the points are shown", panel=LOOK_PANEL)
-    color = tree.menu_input("Color", COLOR_TOOLTIP, panel=LOOK_PANEL)
     mapping = timeline_inputs(tree)
     movie = tree.image_input("Movie", "The movie with the reel's features, as it lies beside the reel", FIELD_PANEL)
     view = tree.menu_input("Seen From", "The colors of a VideoRF depend on the direction of view", FIELD_PANEL)
@@ -81,7 +75,7 @@ def _fill(tree: Tree, reel: VideoReel, shading: Shading) -> None:
     cut = tree.float_input(
         "Minimum Opacity", "Points that absorb less over one spacing are deleted", GAMMA, 0.0, 1.0, FIELD_PANEL
     )
-    of_points, of_splats = points_inputs(tree), splats_inputs(tree)
+    shown = show_inputs(tree)
 
     reel_frame = Float(tree, tree.group(time(), mapping).outputs["Reel Frame"])
     frame = (reel_frame + timeline.FRAME_ROUNDING).floor().at_least(0.0).at_most(reel.frame_count - 1.0)
@@ -90,21 +84,14 @@ def _fill(tree: Tree, reel: VideoReel, shading: Shading) -> None:
     sampled = _chain(
         tree, field_frame(reel), {"Geometry": cloud, "Movie": movie, "Frame": frame, "Minimum Opacity": cut}
     )
-    directions = {CAMERA: _from_camera(tree, of_splats), DIRECTION: along.normalized()}
+    directions = {CAMERA: _from_camera(tree, shown, along), DIRECTION: along.normalized()}
     seen = tree.switch(view, {name: (tip, directions[name]) for name, tip in VIEWS.items()}, "VECTOR")
-    colored = _colored(tree, shading, sampled, seen)
+    colored = _colored(tree, reel, shading, sampled, seen)
     cloud = tree.choose(broken, _alarmed(tree, cloud), colored, "GEOMETRY")
     cloud = _as_gaussians(tree, cloud, reel.lattice.spacing * SPLAT_WIDTH)
-
-    shown_colors = {DISPLAY: cloud, LINEAR: _chain(tree, linear_color(), {"Geometry": cloud})}
-    cloud = tree.switch(color, {name: (tip, shown_colors[name]) for name, tip in COLORS.items()}, "GEOMETRY")
-    shown = {
-        POINTS: _chain(tree, points(), {"Geometry": cloud, **of_points}),
-        SPLATS: _chain(tree, splats(), {"Geometry": cloud, **of_splats}),
-    }
-    cloud = tree.switch(look, {name: (tip, shown[name]) for name, tip in LOOKS.items()}, "GEOMETRY")
-    tree.output("Geometry", cloud, "What renders")
-    for name, default in (("Look", POINTS), ("Color", LINEAR), ("Repeat", timeline.HOLD), ("Seen From", CAMERA)):
+    tree.output("Geometry", show(tree, cloud, shown), "What renders")
+    set_show_defaults(tree, POINTS)
+    for name, default in (("Repeat", timeline.HOLD), ("Seen From", CAMERA)):
         tree.set_menu_default(name, default)
 
 
@@ -131,28 +118,31 @@ def _alarmed(tree: Tree, cloud: Geometry) -> Geometry:
     return tree.store(cloud, "rgb", tree.color(*BROKEN), "FLOAT_COLOR")
 
 
-def _colored(tree: Tree, shading: Shading, cloud: Geometry, seen: Vector) -> Geometry:
+def _colored(tree: Tree, reel: VideoReel, shading: Shading, cloud: Geometry, seen: Vector) -> Geometry:
     features = shading.shape.features
-    names = zip(feature_sockets(features), feature_attributes(features), strict=True)
-    inputs = {socket: tree.attribute(name, "FLOAT_VECTOR") for socket, name in names}
-    decoded = tree.group(decoder(shading), {**inputs, "Direction": seen})
-    color = tree.color(*Vector(tree, decoded.outputs["Color"]).axes())
-    return tree.store(cloud, "rgb", color, "FLOAT_COLOR")
+    values = [tree.attribute(name, "FLOAT_VECTOR") for name in feature_attributes(features)]
+    if fits(shading.shape):
+        inputs = dict(zip(feature_sockets(features), values, strict=True))
+        decoded = tree.group(decoder(shading), {**inputs, "Direction": seen})
+        color = Vector(tree, decoded.outputs["Color"])
+    else:
+        low, high = (np.pad(side[1:4], (0, WIDTH))[:WIDTH] for side in (reel.ranges.low, reel.ranges.high))
+        color = (values[0] - tuple(low.tolist())) * tuple((1.0 / np.maximum(high - low, 1e-12)).tolist())
+    return tree.store(cloud, "rgb", tree.color(*color.axes()), "FLOAT_COLOR")
 
 
-def _from_camera(tree: Tree, inputs: dict[str, Any]) -> Vector:
-    """Return the direction from the camera to each point, in the object's space; one for all if orthographic."""
-    camera = tree.group(view_camera(), {"Follow View": inputs["Follow View"]}).outputs["Camera"]
-    view = View(tree, Object(tree, camera), inputs["Render Width"], inputs["Render Height"])
+def _from_camera(tree: Tree, inputs: dict[str, Any], without: Vector) -> Vector:
+    """Return the direction from the camera to each point, in the object's space; `without` one, that direction."""
+    view = View(tree, inputs["Follow View"], inputs["Render Width"], inputs["Render Height"])
     perspective = 1.0 - view.orthographic
-    ahead = view.back * -1.0 * view.orthographic
-    return ((tree.position() - view.location) * perspective + ahead).normalized()
+    ahead = view.back * -1.0 * view.orthographic  # of an orthographic camera
+    seen = (tree.position() - view.location) * perspective + ahead
+    return tree.choose(view.exists, seen, without, "VECTOR").normalized()
 
 
 def _as_gaussians(tree: Tree, cloud: Geometry, width: float) -> Geometry:
     """Give points what looks read beside `rgb` and `opacity`, and take away what has been used up."""
     cloud = tree.store(cloud, "scale", (width, width, width), "FLOAT_VECTOR")
-    cloud = tree.store(cloud, "rotation", tree.quaternion(1.0, 0.0, 0.0, 0.0), "QUATERNION")
     node = tree.node("GeometryNodeRemoveAttribute", {"Geometry": cloud, "Name": f"{PREFIX}*"})
     set_wildcard(node)
     return Geometry(tree, node.outputs[0])

@@ -3,9 +3,9 @@
 
 from ...core.gaussians.model import OPACITY_MIN
 from ..materials import QUAD_ATTRIBUTE, point_material, splat_material
-from .builder import Boolean, Float, Geometry, Object, Tree
+from .builder import Boolean, Float, Geometry, Tree
 from .library import node_group
-from .view import View, view_camera
+from .view import View
 
 LOW_PASS_PX2, NEAR, JACOBIAN_CLAMP = 0.3, 0.2, 1.3  # the rules the models were trained under
 QUAD_MARGIN = 1.01  # a little larger than where alpha reaches 1/255, so that no edge shows
@@ -86,7 +86,7 @@ def points(tree: Tree) -> None:
 
 
 @node_group(
-    "Holoreel Splats", 2, "Show evaluated Gaussians as the splats they were trained as, seen by the active camera"
+    "Holoreel Splats", 3, "Show evaluated Gaussians as the splats they were trained as, seen by the active camera"
 )
 def splats(tree: Tree) -> None:
     """One quad per Gaussian, parallel to the image plane (EWA splatting), far ones first.
@@ -98,8 +98,7 @@ def splats(tree: Tree) -> None:
     """
     cloud = tree.geometry_input()
     inputs = splats_inputs(tree)
-    camera = tree.group(view_camera(), {"Follow View": inputs["Follow View"]}).outputs["Camera"]
-    view = View(tree, Object(tree, camera), inputs["Render Width"], inputs["Render Height"])
+    view = View(tree, inputs["Follow View"], inputs["Render Width"], inputs["Render Height"])
 
     center = tree.position()
     offset = center - view.location

@@ -10,11 +10,12 @@ from typing import Any
 
 import bpy
 
-from .builder import Geometry, Tree
+from .builder import Boolean, Geometry, Tree
 from .crop import OFF, crop, crop_inputs
 from .hull import hull
 from .library import node_group
 from .looks import linear_color, points, points_inputs, splats, splats_inputs
+from .view import view_camera
 
 SPLATS, HULL, POINTS = "Splats", "Hull", "Points"
 LINEAR, DISPLAY = "Scene-Linear", "Display-Referred (Exact)"
@@ -64,6 +65,12 @@ def show_inputs(tree: Tree) -> dict[str, Any]:
     shown = {
         "Look": tree.menu_input("Look", "How the reel is shown", panel=LOOK_PANEL),
         "Color": tree.menu_input("Color", COLOR_TOOLTIP, panel=LOOK_PANEL),
+        "Workbench": tree.boolean_input(
+            "Workbench",
+            "Show points, because Workbench draws nothing transparent; follows the scene's render engine by itself",
+            False,
+            LOOK_PANEL,
+        ),
     }
     for look in LOOKS.values():
         shown |= look.inputs(tree)
@@ -76,7 +83,7 @@ def set_show_defaults(tree: Tree, look: str = SPLATS) -> None:
         tree.set_menu_default(name, item)
 
 
-@node_group("Holoreel Show", 1, "Crop evaluated points, choose their colors, and show them in one of the looks")
+@node_group("Holoreel Show", 2, "Crop evaluated points, choose their colors, and show them in one of the looks")
 def show_group(tree: Tree) -> None:
     """The inputs are those of `show_inputs`."""
     cloud = tree.geometry_input()
@@ -86,7 +93,13 @@ def show_group(tree: Tree) -> None:
     colored = {DISPLAY: cloud, LINEAR: _chain(tree, linear_color(), {"Geometry": cloud})}
     cloud = tree.switch(inputs["Color"], {name: (tip, colored[name]) for name, tip in COLORS.items()}, "GEOMETRY")
     shown = {name: (look.tooltip, _looking(tree, look, cloud, inputs)) for name, look in LOOKS.items()}
-    tree.output("Geometry", tree.switch(inputs["Look"], shown, "GEOMETRY"), "What renders")
+    # Without a camera there is nothing to face, and Workbench draws nothing transparent.
+    view = tree.group(view_camera(), {name: inputs[name] for name in ("Follow View", "Workbench")}).outputs
+    simple = shown[POINTS][1]
+    faced = tree.choose(Boolean(tree, view["Is There"]), shown[SPLATS][1], simple, "GEOMETRY")
+    shown[SPLATS] = (shown[SPLATS][0], faced)
+    rendered = tree.switch(inputs["Look"], shown, "GEOMETRY")
+    tree.output("Geometry", tree.choose(Boolean(tree, view["Opaque"]), simple, rendered, "GEOMETRY"), "What renders")
     set_show_defaults(tree)
 
 

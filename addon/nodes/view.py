@@ -6,24 +6,36 @@ import bpy
 from .builder import Boolean, Float, Matrix, Object, Tree, Vector
 from .library import node_group
 
-VIEW_GROUP, VIEW_VERSION = "Holoreel View", 1
+VIEW_GROUP, VIEW_VERSION = "Holoreel View", 2
 SWITCH_NODE, SCALE_NODE = "Viewport Camera", "Viewport Camera Scale"  # both take the object that the add-on moves
 
 
 @node_group(VIEW_GROUP, VIEW_VERSION, "The camera that splats face: the active one, or the viewport's own view")
 def view_camera(tree: Tree) -> None:
-    """The add-on moves the viewport's camera (`addon.viewport`); its scale is 0 where the active camera counts."""
+    """The add-on moves the viewport's camera (`addon.viewport`) and says the rest by its scale, which has no other use.
+
+    x is 2 where the viewport looks through no camera, y is 2 where it is shaded as Solid or Wireframe, else they are 1.
+    z is the size of its pixels over those of a render by that camera.
+    """
     follow = tree.boolean_input("Follow View", "Face the 3D viewport's own view where it looks through no camera", True)
+    workbench = tree.boolean_input("Workbench", "Whether the scene is rendered by Workbench", False)
     switch = tree.node("GeometryNodeSwitch", input_type="OBJECT")
     switch.name = SWITCH_NODE
     stands = tree.node("GeometryNodeObjectInfo", transform_space="ORIGINAL")
     stands.name = SCALE_NODE
-    x, _, _ = Vector(tree, stands.outputs["Scale"]).axes()
+    free, plain, pixels = Vector(tree, stands.outputs["Scale"]).axes()
     in_viewport = Boolean(tree, tree.node("GeometryNodeIsViewport").outputs[0])
-    condition = in_viewport & follow & ~x.below(0.5)
-    tree.connect(switch.inputs["Switch"], condition)
+    follows = in_viewport & follow & ~free.below(1.5)
+    tree.connect(switch.inputs["Switch"], follows)
     tree.connect(switch.inputs["False"], Object(tree, tree.node("GeometryNodeInputActiveCamera").outputs[0]))
-    tree.output("Camera", Object(tree, switch.outputs[0]), "The camera to face")
+    camera = Object(tree, switch.outputs[0])
+    tree.output("Camera", camera, "The camera to face")
+    chosen = tree.node("GeometryNodeObjectInfo", {"Object": camera}, transform_space="ORIGINAL")
+    is_there = ~Vector(tree, chosen.outputs["Scale"]).length().below(1e-12)  # an object that is not there has no scale
+    tree.output("Is There", is_there, "Whether there is a camera to face")
+    tree.output("Pixel Scale", tree.choose(follows, pixels, 1.0, "FLOAT"), "Size of a pixel over that of a render")
+    opaque = tree.choose(in_viewport, ~plain.below(1.5), workbench, "BOOLEAN")
+    tree.output("Opaque", opaque, "Whether nothing can be drawn but opaque surfaces")
 
 
 class View:
@@ -34,7 +46,11 @@ class View:
     world's lengths along those axes. Where the object is moved and turned alone, vectors and covectors are the same.
     """
 
-    def __init__(self, tree: Tree, camera: Object, width_px: Float, height_px: Float) -> None:
+    def __init__(self, tree: Tree, follow: Boolean, width_px: Float, height_px: Float) -> None:
+        """`follow` and the size of the rendered picture are inputs of a look."""
+        chosen = tree.group(view_camera(), {"Follow View": follow}).outputs
+        camera, pixel_scale = Object(tree, chosen["Camera"]), Float(tree, chosen["Pixel Scale"])
+        self.exists = Boolean(tree, chosen["Is There"])
         from_object = _transform(tree, camera, "RELATIVE")
         # Blender takes a camera's axes for one unit long, whatever the camera is scaled by.
         lengths = [axis.length() for axis in _transform(tree, camera, "ORIGINAL").columns()[:3]]
@@ -42,7 +58,6 @@ class View:
         self.right, self.up, self.back = (axis * (1.0 / length) for axis, length in zip(axes, lengths, strict=True))
         rows = from_object.inverted().transposed().columns()[:3]
         self.across, self.above, self.behind = (row * length for row, length in zip(rows, lengths, strict=True))
-        self.exists = ~lengths[0].below(1e-12)
         # World units per unit of the object: the geometric mean over the axes.
         self.scale = self.across.dot(self.above.cross(self.behind)).absolute().power(1 / 3)
 
@@ -51,8 +66,8 @@ class View:
         # Half the tangent of the field of view, and the size of a pixel at depth 1 (anywhere, if orthographic).
         self.tangent_x = 1.0 / Float(tree, entries["Column 1 Row 1"])
         self.tangent_y = 1.0 / Float(tree, entries["Column 2 Row 2"])
-        self.pixel_x = self.tangent_x * 2.0 / width_px
-        self.pixel_y = self.tangent_y * 2.0 / height_px
+        self.pixel_x = self.tangent_x * 2.0 / width_px * pixel_scale
+        self.pixel_y = self.tangent_y * 2.0 / height_px * pixel_scale
         self.orthographic = Float(tree, info.outputs["Is Orthographic"])
 
 

@@ -138,6 +138,9 @@ def test_changed_inputs_show_at_once(random_model: Model) -> None:
     for offset in (0.0, 5.0, 2.5):
         compat.set_input(modifier, "Offset", offset)
         assert_same(evaluated(reel), model.evaluate(offset / 10))
+    camera = bpy.data.objects.new("camera", bpy.data.cameras.new("camera"))
+    bpy.context.scene.collection.objects.link(camera)
+    bpy.context.scene.camera = camera  # without one, splats are shown as points
     for look, points in (("Splats", False), (POINTS, True)):
         compat.set_input(modifier, "Look", look)
         assert bool(len(evaluated(reel)["position"])) == points
