@@ -59,7 +59,7 @@ def find_python(chosen: str) -> Path:
         (os.environ.get(ENVIRONMENT_VARIABLE, ""), f"${ENVIRONMENT_VARIABLE}"),
     ):
         if path:
-            return _existing(Path(bpy.path.abspath(path)).expanduser(), source)
+            return _existing(Path(path).expanduser(), source)
     for folder in (default_folder(), ROOT / ".venv"):
         if python_in(folder).is_file():
             return python_in(folder)

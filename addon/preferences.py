@@ -96,7 +96,7 @@ def cache_mb() -> int:
 def log_folder() -> Path:
     """Return the folder of logs and of the state of jobs; it need not exist yet."""
     chosen = str(_get("log_folder"))
-    return Path(bpy.path.abspath(chosen)).expanduser() if chosen else environment.user_folder("logs")
+    return Path(chosen).expanduser() if chosen else environment.user_folder("logs")
 
 
 def choose_environment(python: str) -> None:

@@ -22,7 +22,12 @@ _RIGS = (
 class HoloreelSynthSettings(bpy.types.PropertyGroup):
     """Which cameras film what, and where the capture goes; kept in the scene."""
 
-    out: bpy.props.StringProperty(name="Capture", description="Folder of the capture to render", subtype="DIR_PATH")
+    out: bpy.props.StringProperty(
+        name="Capture",
+        description="Folder of the capture to render",
+        subtype="DIR_PATH",
+        options={"PATH_SUPPORTS_BLEND_RELATIVE"},
+    )
     rig: bpy.props.EnumProperty(name="Rig", description="How the cameras stand", items=_RIGS)
     cameras: bpy.props.IntProperty(
         name="Cameras",

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import bpy
 
+from ..core import presets
 from ..core.errors import HoloreelError
 from ..core.jobs import Command, JobRecord
 from .environment import version_check
@@ -16,18 +17,6 @@ _METHODS = (
     ("stg", "Spacetime Gaussians", "Whole scenes: Gaussians that move, turn, come and go"),
     ("videorf", "VideoRF", "A subject with masks: a radiance field whose features are a video"),
 )
-_STG_PRESETS = (
-    ("lite", "Lite", "Each Gaussian has a color: plays exactly in Blender's own engines"),
-    ("full", "Full", "Features and a network per pixel: exact in the Holoreel engine alone"),
-    ("n3v", "Neural 3D Video", "The published settings for captures like the Neural 3D Video data set"),
-    ("technicolor", "Technicolor", "The published settings for captures like the Technicolor data set"),
-    ("immersive", "Immersive", "The published settings for fisheye captures like Google's Immersive data set"),
-)
-_VIDEORF_PRESETS = (
-    ("standard", "Standard", "Good pictures in few bytes"),
-    ("fast", "Fast", "For a first look"),
-    ("paper", "Paper", "The published method with nothing added"),
-)
 
 
 class HoloreelTrainSettings(bpy.types.PropertyGroup):
@@ -37,16 +26,20 @@ class HoloreelTrainSettings(bpy.types.PropertyGroup):
         name="Capture",
         description="Folder of a multi-view recording, in any layout that `holoreel info` knows",
         subtype="DIR_PATH",
+        options={"PATH_SUPPORTS_BLEND_RELATIVE"},
     )
     out: bpy.props.StringProperty(
-        name="Reel", description="The .reel file to write; its data go into files beside it", subtype="FILE_PATH"
+        name="Reel",
+        description="The .reel file to write; its data go into files beside it",
+        subtype="FILE_PATH",
+        options={"PATH_SUPPORTS_BLEND_RELATIVE"},
     )
     method: bpy.props.EnumProperty(name="Method", description="What kind of reel to train", items=_METHODS)
     stg_preset: bpy.props.EnumProperty(
-        name="Preset", description="Settings to train Spacetime Gaussians with", items=_STG_PRESETS
+        name="Preset", description="Settings to train Spacetime Gaussians with", items=presets.STG
     )
     videorf_preset: bpy.props.EnumProperty(
-        name="Preset", description="Settings to train a VideoRF with", items=_VIDEORF_PRESETS
+        name="Preset", description="Settings to train a VideoRF with", items=presets.VIDEORF
     )
     all_frames: bpy.props.BoolProperty(
         name="All Frames", description="Take all frames that the capture has", default=True

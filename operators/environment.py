@@ -51,11 +51,13 @@ class HOLOREEL_OT_create_environment(Reporting, bpy.types.Operator):
         name="Folder",
         description="Where the environment goes; empty takes a folder among the extension's own files",
         subtype="DIR_PATH",
+        options={"PATH_SUPPORTS_BLEND_RELATIVE"},
     )
     base: bpy.props.StringProperty(
         name="Base Python",
         description="The Python it is made with, 3.11 or newer; empty takes Blender's own",
         subtype="FILE_PATH",
+        options={"PATH_SUPPORTS_BLEND_RELATIVE"},
     )
     package: bpy.props.StringProperty(
         name="Package",
@@ -64,11 +66,13 @@ class HOLOREEL_OT_create_environment(Reporting, bpy.types.Operator):
             "extension itself holds only what Blender's Python can run"
         ),
         subtype="FILE_PATH",
+        options={"PATH_SUPPORTS_BLEND_RELATIVE"},
     )
     wheels: bpy.props.StringProperty(
         name="Wheels",
         description="Folder with wheels of all that is needed: then nothing comes from the network",
         subtype="DIR_PATH",
+        options={"PATH_SUPPORTS_BLEND_RELATIVE"},
     )
     cuda: bpy.props.BoolProperty(
         name="For a Graphics Card",

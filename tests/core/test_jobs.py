@@ -10,9 +10,11 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from holoreel.core import supervise
+from holoreel.core import presets, supervise
 from holoreel.core.errors import HoloreelError
+from holoreel.core.gaussians import config as gaussians
 from holoreel.core.jobs import Command, Job, JobRecord, State, begin, job_folders, open_job
+from holoreel.core.videorf import config as videorf
 
 PYTHON = Path(sys.executable)
 PATIENCE = 30.0  # seconds; a machine may be busy
@@ -176,3 +178,8 @@ def test_a_foreign_ending_is_a_failure(tmp_path: Path) -> None:
     for text in ("torn", json.dumps({"status": "0"}), "[]"):
         (job.folder / "end.json").write_text(text)
         assert open_job(job.folder).state == State.FAILED
+
+
+def test_presets_are_told_by_the_names_they_have() -> None:
+    assert [name for name, *_ in presets.STG] == list(gaussians.PRESETS)
+    assert [name for name, *_ in presets.VIDEORF] == list(videorf.PRESETS)
