@@ -448,6 +448,7 @@ TABLES = {
     "immersive": ["models.json"],
     "videos": ["cameras_opencv.json", "timestamps.csv"],
     "rerf": ["CamPose.inf", "Intrinsic.inf", "bbox.json"],
+    "actorshq": ["1x/calibration.csv", "aabbs.csv"],
     "colmap": [f"{MODEL}cameras.bin", f"{MODEL}images.bin", f"{MODEL}points3D.bin"],
 }
 
