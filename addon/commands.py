@@ -10,7 +10,7 @@ import argparse
 import math
 import subprocess
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -69,6 +69,7 @@ def _import(arguments: list[str]) -> None:
     parser.add_argument("files", nargs="+", metavar="FILE", help="a .reel, .ply, .stgc or .splatv")
     parser.add_argument("--out", required=True, type=Path, metavar="SCENE.blend", help="where the scene is saved")
     parser.add_argument("--into", type=Path, metavar="SCENE.blend", help="the scene to add to; an empty one without it")
+    parser.add_argument("--start", type=float, help="scene frame of the first frame; the reel's own without it")
     parser.add_argument(
         "--pace",
         choices=("frames", "real_time"),
@@ -80,24 +81,37 @@ def _import(arguments: list[str]) -> None:
         choices=("file", *reels.UPRIGHT),
         help="the file's axis that shall point up, as --up=-Y; nothing is turned without it",
     )
+    parser.add_argument("--scale", type=float, default=1.0, help="Blender units for one unit of the file")
     parser.add_argument(
-        "--set-scene-timing",
-        action="store_true",
-        help="set the scene's frame range and frame rate to the (last) reel's",
+        "--set-scene-timing", action="store_true", help="set the scene's frame range and rate to the (last) reel's"
     )
+    parser.add_argument(
+        "--detail", type=float, default=100.0, help="percentage of the Gaussians to import, the most important first"
+    )
+    parser.add_argument(
+        "--beside", action="store_true", help="keep the points in a .blend beside the reel instead of in this one"
+    )
+    parser.add_argument("--rung", help="of a VideoRF: which rate, by its QP as 20; the best without it")
     parser.add_argument("--look", choices=_words(LOOKS), help="how the reels are shown")
     parser.add_argument("--color", choices=_words(COLORS), help="scene-linear colors, or display-referred (exact) ones")
     chosen = parser.parse_args(arguments)
     if chosen.out.suffix.lower() != ".blend":
         raise HoloreelError(f"--out {chosen.out}: a scene is saved as a .blend; choose this ending.")
+    if not (math.isfinite(chosen.scale) and chosen.scale > 0.0 and 0.0 < chosen.detail <= 100.0):
+        raise HoloreelError("--scale is above 0, and --detail above 0 and at most 100: give numbers like these.")
     _open(chosen.into)
     for file in chosen.files:
         imported = reels.import_reel(
             bpy.context,
             file,
+            start=chosen.start,
             pace=reels.REAL_TIME if chosen.pace == "real_time" else reels.FRAME_BY_FRAME,
             up=reels.FROM_FILE if chosen.up == "file" else chosen.up,
+            scale=chosen.scale,
             set_scene_timing=chosen.set_scene_timing,
+            detail=chosen.detail,
+            beside=chosen.beside,
+            rung=chosen.rung,
         )
         for title, word, items in (("Look", chosen.look, LOOKS), ("Color", chosen.color, COLORS)):
             if word:
@@ -233,7 +247,7 @@ def _color(text: str) -> list[float]:
     return color
 
 
-def _words(items: dict[str, str]) -> dict[str, str]:
+def _words(items: Iterable[str]) -> dict[str, str]:
     """Map words for a command line to the names of a menu's items: `scene-linear` to `Scene-Linear`."""
     return {name.split(" (")[0].lower().replace(" ", "-"): name for name in items}
 

@@ -38,7 +38,7 @@ def listener(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
 
 def test_import_saves_a_scene_that_plays(reel: Path, tmp_path: Path) -> None:
     out = tmp_path / "new" / "scene.blend"
-    words = ["--look", "points", "--color", "display-referred", "--up=-Y", "--set-scene-timing"]
+    words = ["--look", "points", "--color", "display-referred", "--up=-Y", "--scale", "2", "--set-scene-timing"]
     assert commands.run(["import", str(reel), str(reel), "--out", str(out), *words]) == 0
     bpy.ops.wm.open_mainfile(filepath=str(out))
     assert [o.name for o in bpy.data.objects] == ["walk", "walk.001"]
@@ -47,7 +47,7 @@ def test_import_saves_a_scene_that_plays(reel: Path, tmp_path: Path) -> None:
     assert compat.get_input(modifier, "Color") == "Display-Referred (Exact)"
     assert (bpy.context.scene.frame_start, bpy.context.scene.frame_end) == (5, 14)
     turned = bpy.data.objects["walk"].matrix_world @ Vector((0.0, -1.0, 0.0))
-    assert tuple(turned) == pytest.approx((0.0, 0.0, 1.0), abs=1e-6)
+    assert tuple(turned) == pytest.approx((0.0, 0.0, 2.0), abs=1e-6)
 
 
 def test_import_adds_to_a_scene(reel: Path, tmp_path: Path) -> None:
@@ -68,6 +68,7 @@ def test_import_adds_to_a_scene(reel: Path, tmp_path: Path) -> None:
         (["import", "{reel}", "--out", "{out}.reel"], "saved as a .blend"),
         (["import", "{reel}", "--into", "{absent}", "--out", "{out}.blend"], "--into"),
         (["import", "{reel}", "--out", "{reel}/x.blend"], "cannot be written"),
+        (["import", "{reel}", "--out", "{out}.blend", "--detail", "0"], "--detail"),
         (["import", "{reel}"], "--out"),
         (["render", "{reel}", "--engine", "cycles", "--out", "{out}.png", "--camera", "{absent}"], "say when"),
         (["render", "{reel}", "--engine", "cycles", "--out", "{out}.png", "--camera", "{absent}", "--time=0"], "abs"),
