@@ -88,11 +88,12 @@ SEGMENT_NAMES = ("stg_first", "stg_frames", "stg_until")
 def write(
     cloud: bpy.types.PointCloud,
     gaussians: SpacetimeGaussians,
+    order: NDArray[np.int64] | None = None,
     segments: Mapping[str, NDArray[np.float32]] | None = None,
 ) -> None:
-    """Write the whole table into a point cloud that has as many points as there are Gaussians.
+    """Write the rows of a model that `order` selects, or all, into a point cloud of as many points.
 
-    `segments` has a column (N,) for each of `SEGMENT_NAMES`; without it all points belong to one segment.
+    `segments` has a column for each of `SEGMENT_NAMES`, with the model's rows; without it all belong to one segment.
     """
     columns = {name: (Kind.FLOAT, lambda values=values: values) for name, values in (segments or {}).items()}
     columns |= {row.name: (row.kind, lambda row=row: row.read(gaussians)) for row in TABLE}
@@ -100,8 +101,9 @@ def write(
     for name, (kind, _) in columns.items():
         if name not in cloud.attributes:
             cloud.attributes.new(name, kind.type_name, "POINT")
+    rows = slice(None) if order is None else order
     for name, (kind, values_of) in columns.items():
-        values = np.ascontiguousarray(values_of(), dtype=np.float32)
+        values = np.ascontiguousarray(values_of()[rows], dtype=np.float32)
         cloud.attributes[name].data.foreach_set(kind.property_name, values.ravel())
 
 

@@ -28,10 +28,17 @@ ENDLESS = 1e9  # the last segment ends at this frame
 
 @dataclass(frozen=True)
 class Points:
-    """What one point cloud holds: lite Gaussians (N), and of several segments the columns of `SEGMENT_NAMES` (N,)."""
+    """What one point cloud holds: rows of a lite model, all or those that `order` selects, without a copy of them.
+
+    `segments` has, for the rows of several segments, the columns of `SEGMENT_NAMES`, one number for each row.
+    """
 
     gaussians: SpacetimeGaussians
+    order: NDArray[np.int64] | None = None
     segments: dict[str, NDArray[np.float32]] | None = None
+
+    def __len__(self) -> int:
+        return len(self.gaussians if self.order is None else self.order)
 
 
 def join(parts: Sequence[Loaded], detail: float = 100.0) -> Points:
@@ -40,10 +47,10 @@ def join(parts: Sequence[Loaded], detail: float = 100.0) -> Points:
     order = most_important_first(models)
     order = order[: max(1, math.ceil(len(order) * detail / 100.0))]
     if len(models) == 1:
-        return Points(models[0].take(order))
+        return Points(models[0], order)
     sizes = [len(model) for model in models]
-    segments = {name: np.repeat(values, sizes)[order].astype(np.float32) for name, values in _windows(parts).items()}
-    return Points(concatenate(models).take(order), segments)
+    segments = {name: np.repeat(np.float32(values), sizes) for name, values in _windows(parts).items()}
+    return Points(concatenate(models), order, segments)
 
 
 def _windows(parts: Sequence[Loaded]) -> dict[str, list[float]]:
@@ -55,8 +62,8 @@ def _windows(parts: Sequence[Loaded]) -> dict[str, list[float]]:
 
 def new_cloud_object(context: bpy.types.Context, name: str, points: Points) -> bpy.types.Object:
     """Return a new point cloud object with these points, in the context's collection."""
-    created = new_point_cloud(context, name, len(points.gaussians))
-    attributes.write(created.data, points.gaussians, points.segments)
+    created = new_point_cloud(context, name, len(points))
+    attributes.write(created.data, points.gaussians, points.order, points.segments)
     return created
 
 

@@ -116,7 +116,7 @@ def play(tree: Tree, cloud: Geometry, mapping: dict[str, Any], kept: dict[str, A
     return Geometry(tree, tree.group(evaluate(), parts).outputs["Geometry"])
 
 
-@node_group("Holoreel Evaluate", 2, "Evaluate Spacetime Gaussians at a time and delete those that cannot be seen then")
+@node_group("Holoreel Evaluate", 3, "Evaluate Spacetime Gaussians at a time and delete those that cannot be seen then")
 def evaluate(tree: Tree) -> None:
     """Spacetime Gaussians, Eqs. 7 to 9. Consumes the attributes `stg_*`; stores `opacity` and `rotation`."""
     points = tree.geometry_input()
@@ -127,7 +127,6 @@ def evaluate(tree: Tree) -> None:
     widths = dt * tree.attribute("stg_inverse_width", "FLOAT")
     opacity = tree.attribute("stg_opacity", "FLOAT") * (-(widths * widths)).exp()
     points = tree.store(points, "opacity", opacity, "FLOAT")
-    points = tree.delete_points(points, tree.attribute("opacity", "FLOAT").below(cut))
 
     quat = [
         start + speed * dt
@@ -142,7 +141,10 @@ def evaluate(tree: Tree) -> None:
     motions = [tree.attribute(f"stg_motion_{order}", "FLOAT_VECTOR") for order in (1, 2, 3)]
     position = tree.position() + (motions[0] + (motions[1] + motions[2] * dt) * dt) * dt
     points = tree.geometry("GeometryNodeSetPosition", {"Geometry": points, "Position": position})
-    tree.output("Geometry", _without_parameters(tree, points), "Gaussians at that time")
+    # Points are deleted last, when there is least to copy of those that stay: half the memory.
+    points = _without_parameters(tree, points)
+    points = tree.delete_points(points, tree.attribute("opacity", "FLOAT").below(cut))
+    tree.output("Geometry", points, "Gaussians at that time")
 
 
 def _without_parameters(tree: Tree, points: Geometry) -> Geometry:

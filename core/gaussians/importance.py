@@ -26,10 +26,13 @@ def most_important_first(segments: Sequence[SpacetimeGaussians]) -> NDArray[np.i
     Within a segment that is by `importance`; the segments take turns by their sizes, so that the first part of the
     whole is the same part of each.
     """
+    orders = [np.argsort(-importance(gaussians), kind="stable") for gaussians in segments]
+    if len(orders) == 1:
+        return orders[0]
     places = []
-    for gaussians in segments:
-        place = np.empty(len(gaussians))
-        place[np.argsort(-importance(gaussians), kind="stable")] = np.arange(len(gaussians)) / max(1, len(gaussians))
+    for order in orders:
+        place = np.empty(len(order))
+        place[order] = np.arange(len(order)) / max(1, len(order))
         places.append(place)
     return np.argsort(np.concatenate(places), kind="stable")
 
