@@ -346,7 +346,7 @@ def test_colmaps_simpler_lenses(tmp_path: Path, name: str) -> None:
 
 
 def test_every_layout_is_found_and_named(small: Capture, tmp_path: Path) -> None:
-    assert set(LAYOUTS) == {*CASES, "immersive", "rerf"}
+    assert set(LAYOUTS) == {*CASES, "immersive", "rerf", "actorshq"}
     with pytest.raises(HoloreelError, match=r"is not there, none of the captures"):
         read_capture(tmp_path / "absent")
     (tmp_path / "notes.txt").write_text("hello")
