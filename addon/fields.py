@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from ..core.errors import HoloreelError
 from ..core.videorf.codec import FeatureVideo
-from ..core.videorf.decode import find_rung, frames_text, rung_name
+from ..core.videorf.decode import find_rung, frames_text, rung_name, rung_order
 from ..core.videorf.mapping import MappingTable
 from ..core.videorf.package import VideoReel
 from ..core.videorf.shading import Shading
@@ -70,7 +70,6 @@ def add_field_reel(
             f"The network has {shading.shape.hidden} hidden units, too many for nodes: colors are only a hint here, "
             "the Holoreel engine draws the true ones."
         )
-    report.append(f"The features stay in {video.path.name}: keep it where it is, or beside the reel.")
     created[INFO] = {
         "source": str(reel.path),
         "kind": "videorf",
@@ -160,18 +159,25 @@ def _uv(table: MappingTable, picture: tuple[int, int]) -> NDArray[np.float64]:
     return np.stack(((column + 0.5) / picture[1], 1.0 - (row + 0.5) / picture[0]), 1)
 
 
+def rungs_of(reel: VideoReel) -> list[tuple[str, str, int]]:
+    """Return name, file and size of the rungs that are there, the one that plays by itself first."""
+    return [
+        (rung_name(rung), rung.file, rung.video.size)
+        for rung in (reel.rungs[place] for place in rung_order(reel))
+        if (reel.path.parent / rung.file).is_file()
+    ]
+
+
 def _available_rung(reel: VideoReel, wanted: int | str | None) -> tuple[int, list[str]]:
     """Return the rung to play; the best one that is there, and a sentence about it, if it is not the reel's best."""
     best = find_rung(reel, wanted)
-    if wanted is not None or (reel.path.parent / reel.rungs[best].file).is_file():
+    missing = f"{reel.path}: its movie '{reel.rungs[best].file}' is missing"
+    if (reel.path.parent / reel.rungs[best].file).is_file():
         return best, []
-    order = sorted(range(len(reel.rungs)), key=lambda k: (reel.rungs[k].codec != "h264", reel.rungs[k].qp))
-    for candidate in order:
-        if (reel.path.parent / reel.rungs[candidate].file).is_file():
-            return candidate, [
-                f"{reel.rungs[best].file} is missing: rung {rung_name(reel.rungs[candidate])} is shown instead."
-            ]
-    raise HoloreelError(f"{reel.path}: its movie '{reel.rungs[best].file}' is missing; put it beside the reel.")
+    there = rungs_of(reel)
+    if wanted is not None or not there:
+        raise HoloreelError(f"{missing}; put it beside the reel.")
+    return find_rung(reel, there[0][0]), [f"{missing}: rung {there[0][0]} is shown instead."]
 
 
 def _load_movie(video: FeatureVideo) -> bpy.types.Image:

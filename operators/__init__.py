@@ -7,6 +7,7 @@ from types import ModuleType
 def _modules() -> tuple[ModuleType, ...]:
     from . import (
         add_crop_box,
+        choose_rung,
         environment,
         import_reel,
         jobs,
@@ -22,6 +23,7 @@ def _modules() -> tuple[ModuleType, ...]:
         reload_reel,
         setup_exact_render,
         add_crop_box,
+        choose_rung,
         let_rays_through,
         environment,
         train,

@@ -92,6 +92,10 @@ class HOLOREEL_OT_import_reel(bpy.types.Operator, ImportHelper):
         ),
         default=False,
     )
+    rung: bpy.props.StringProperty(
+        name="Rate",
+        description="Which movie of a VideoRF to play, by its QP, as 20 or hevc:20; empty plays the best that is there",
+    )
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
@@ -134,6 +138,7 @@ class HOLOREEL_OT_import_reel(bpy.types.Operator, ImportHelper):
             set_scene_timing=self.set_scene_timing,
             detail=self.detail,
             beside=self.beside,
+            rung=self.rung.strip() or None,
         )
 
     def _paths(self) -> list[Path]:

@@ -108,13 +108,18 @@ def rung_name(rung: Rung) -> str:
     return f"{rung.codec}:{rung.qp}"
 
 
+def rung_order(reel: VideoReel) -> list[int]:
+    """Return the places of all rungs: H.264 first, and of each kind the lowest QP first."""
+    return sorted(range(len(reel.rungs)), key=lambda k: (reel.rungs[k].codec != PREFERRED, reel.rungs[k].qp))
+
+
 def find_rung(reel: VideoReel, wanted: int | str | None = None) -> int:
     """Return the place of a rung in its reel: of a place, a name like "20" or "hevc:20", or the best (None).
 
     The best is the H.264 rung of lowest QP; a QP alone means the H.264 rung where several codecs have it. Raises
     `HoloreelError` where there is no such rung.
     """
-    order = sorted(range(len(reel.rungs)), key=lambda k: (reel.rungs[k].codec != PREFERRED, reel.rungs[k].qp))
+    order = rung_order(reel)
     if wanted is None:
         return order[0]
     if isinstance(wanted, int):

@@ -3,17 +3,19 @@
 
 import shutil
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
 import bpy
+import holoreel
 import numpy as np
 import pytest
 from holoreel.addon import attributes, fields, reels
 from holoreel.addon.compat import get_input, set_input
 from holoreel.addon.nodes.builder import Tree, Value
-from holoreel.addon.nodes.decoder import decoder, feature_sockets
-from holoreel.addon.nodes.field import BROKEN, CAMERA, DIRECTION, feature_attributes, field_frame
+from holoreel.addon.nodes.decoder import decoder, feature_sockets, fits
+from holoreel.addon.nodes.field import BROKEN, CAMERA, DIRECTION, feature_attributes, field_frame, field_reel
 from holoreel.addon.nodes.reel import DISPLAY, SPLATS
 from holoreel.addon.timeline import HOLD, LOOP, PING_PONG, Timeline
 from holoreel.core.errors import HoloreelError
@@ -53,6 +55,7 @@ def shown(played: bpy.types.Object, frame: float) -> Shown:
 def ball_blend(tmp_path_factory: pytest.TempPathFactory) -> str:
     """A .blend with the ball: its node groups take longer to build than to load."""
     path = str(tmp_path_factory.mktemp("blend") / "ball.blend")
+    bpy.ops.wm.read_factory_settings(use_empty=True)
     played = reels.import_reel(bpy.context, DATA / "ball.reel")
     set_input(reels.modifier_of(played), "Color", DISPLAY)
     set_input(reels.modifier_of(played), "Hide Fainter Than", 0.0)
@@ -164,8 +167,8 @@ def test_colors_along_a_stated_direction_need_no_camera(
 ) -> None:
     modifier = reels.modifier_of(ball)
     assert get_input(modifier, "Seen From") == CAMERA
-    set_input(modifier, "Seen From", DIRECTION)
-    for way in ((0.0, 1.0, 0.0), (3.0, -1.0, 0.5)):
+    for view, way in ((CAMERA, (0.5, 1.0, -0.5)), (DIRECTION, (3.0, -1.0, 0.5))):
+        set_input(modifier, "Seen From", view)
         set_input(modifier, "Direction", way)
         expected = expected_colors(reel, rows[8], 8, None, np.array(way))
         np.testing.assert_allclose(shown(ball, 9).rgb, expected, atol=2e-5)
@@ -217,6 +220,19 @@ def test_networks_of_any_shape_are_computed_in_nodes(shape: ShadingShape) -> Non
     np.testing.assert_allclose(computed.reshape(50, 3), shading(features, ways), atol=1e-5)
 
 
+def test_networks_too_large_for_nodes_leave_a_hint(ball: bpy.types.Object, reel: VideoReel, rows: list[Array]) -> None:
+    shape = ShadingShape(7, 1, 64)
+    assert fits(reel.shading)
+    assert not fits(shape)
+    layers = tuple((np.zeros((o, i), np.float32), np.zeros(o, np.float32)) for o, i in shape.layers)
+    group = field_reel(replace(reel, shading=shape), Shading(shape, layers))
+    reels.modifier_of(ball).node_group = group  # inputs keep their values
+    set_input(reels.modifier_of(ball), "Color", DISPLAY)
+    kept = opacity(rows[2][:, 0].astype(np.float64)) > GAMMA
+    low, high = np.array(reel.ranges.low[1:4]), np.array(reel.ranges.high[1:4])
+    np.testing.assert_allclose(shown(ball, 3).rgb, (rows[2][kept, 1:4] - low) / (high - low), atol=1e-5)
+
+
 def test_the_timeline_chooses_whole_frames(ball: bpy.types.Object, reel: VideoReel, rows: list[Array]) -> None:
     counts = [int((opacity(row[:, 0].astype(np.float64)) > GAMMA).sum()) for row in rows]
     firsts = [row[0, 0] for row in rows]
@@ -253,7 +269,7 @@ def test_whole_frames_survive_rounding() -> None:
 def test_what_is_shown_looks_like_gaussians(ball: bpy.types.Object, reel: VideoReel) -> None:
     geometry = evaluated(ball, 1)
     names = {attribute.name for attribute in geometry.pointcloud.attributes}
-    assert {"rgb", "opacity", "scale", "rotation", "radius"} <= names
+    assert {"rgb", "opacity", "scale", "radius"} <= names
     assert not [name for name in names if name.startswith("field_")]
     radius = attributes.read(geometry.pointcloud.attributes, "radius")
     assert radius.min() > reel.lattice.spacing * 3**0.5 / 2  # no gaps between neighbors
@@ -322,12 +338,31 @@ def test_rungs_are_chosen_on_import_and_later(reel: VideoReel) -> None:
         fields.set_rung(add_camera((0, 0, 0), Euler()), reel)
 
 
+def test_operator_and_panel_change_the_movie(ball: bpy.types.Object, tmp_path: Path) -> None:
+    holoreel.register()
+    try:
+        bpy.context.view_layer.objects.active = ball
+        assert bpy.types.HOLOREEL_PT_field.poll(bpy.context)
+        assert bpy.ops.holoreel.choose_rung(rung="h264:34") == {"FINISHED"}
+        assert ball[reels.INFO]["rung"] == "h264:34"
+        with pytest.raises(TypeError, match="h264:18"):
+            bpy.ops.holoreel.choose_rung(rung="h264:20")
+        bpy.ops.wm.read_factory_settings(use_empty=True)
+        assert not bpy.ops.holoreel.choose_rung.poll()
+        assert not bpy.types.HOLOREEL_PT_field.poll(bpy.context)
+        result = bpy.ops.holoreel.import_reel(filepath=str(copied(tmp_path)), rung="34")
+        assert result == {"FINISHED"}
+        assert bpy.context.object[reels.INFO]["rung"] == "h264:34"
+    finally:
+        holoreel.unregister()
+
+
 @pytest.mark.usefixtures("ball")
 def test_the_best_rung_that_is_there_is_taken(tmp_path: Path) -> None:
     path = copied(tmp_path)
     (tmp_path / "ball.qp18.mp4").unlink()
     played = reels.import_reel(bpy.context, path)
-    assert "ball.qp18.mp4 is missing: rung h264:34 is shown" in played[reels.INFO]["report"]
+    assert "movie 'ball.qp18.mp4' is missing: rung h264:34 is shown" in played[reels.INFO]["report"]
     (tmp_path / "ball.qp34.mp4").unlink()
     with pytest.raises(HoloreelError, match=r"movie 'ball\.qp18\.mp4' is missing"):
         reels.import_reel(bpy.context, path)
