@@ -15,6 +15,7 @@ The job goes on when the program that started it ends; another one finds it by i
 import os
 import secrets
 import shutil
+import signal
 import subprocess
 import time
 from collections.abc import Callable, Mapping
@@ -31,6 +32,7 @@ from .status import Status, read_status
 
 _TAIL_BYTES = 4096
 _TAKEN = "taken"
+_SIGKILL = 9  # which Windows does not name
 _TEXTS = ("kind", "title", "result", "checkpoint", "resume_flag")
 
 
@@ -200,8 +202,16 @@ class Job:
         elif cancelled:
             self.state, self.message = State.STOPPED, ""
         else:
-            self.state = State.FAILED
-            self.message = self._last_words() or "it ended without a word"
+            self.state, self.message = State.FAILED, self._obituary(status)
+
+    def _obituary(self, status: object) -> str:
+        """Say why a job has failed."""
+        if not isinstance(status, int):
+            return "it was ended from outside, or the disk of the log folder is full; resume it to go on."
+        if status < 0:
+            reason = ", as systems do when memory runs out" if status == -_SIGKILL else ""
+            return f"it was ended by {_signal_name(-status)}{reason}; resume it to go on."
+        return self._last_words() or f"it ended with status {status} and without a word."
 
     def _last_words(self) -> str:
         """Return the last line of the log, without the command's name before it."""
@@ -214,6 +224,13 @@ class Job:
         last = next((line.strip() for line in reversed(lines) if line.strip()), "")
         command, _, sentence = last.partition(": ")
         return sentence if command.startswith("holoreel ") else last.removeprefix("$ ")
+
+
+def _signal_name(number: int) -> str:
+    try:
+        return signal.Signals(number).name
+    except ValueError:
+        return f"signal {number}"
 
 
 def begin(

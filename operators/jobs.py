@@ -89,7 +89,11 @@ class HOLOREEL_OT_import_result(_OfJob, bpy.types.Operator):
         """Import it into the active scene."""
         if context.mode != "OBJECT":
             raise HoloreelError("a reel is imported in Object Mode: leave the mode you are in first.")
-        jobs.take_reel(context, self.chosen())
+        imported = jobs.take_reel(context, self.chosen())
+        for chosen in context.selected_objects:
+            chosen.select_set(False)
+        imported.select_set(True)
+        context.view_layer.objects.active = imported
 
 
 class HOLOREEL_OT_remove_job(_OfJob, bpy.types.Operator):

@@ -123,7 +123,19 @@ def test_a_killed_job_is_told_from_one_that_runs(tmp_path: Path) -> None:
     assert job.state.alive  # what it started still runs, and still holds the lock
     os.killpg(group, signal.SIGKILL)
     assert wait(job) == State.FAILED
+    assert "ended from outside" in job.message
     assert open_job(job.folder).state == State.FAILED
+
+
+def test_a_command_that_was_killed_or_says_nothing_is_spoken_for(tmp_path: Path) -> None:
+    killed = job_of(tmp_path, "import os; os.kill(os.getpid(), 9)")
+    mute = job_of(tmp_path, "")
+    assert wait(killed) == State.FAILED
+    assert killed.message == "it was ended by SIGKILL, as systems do when memory runs out; resume it to go on."
+    assert wait(mute) == State.DONE
+    mute.log.write_text("")
+    (mute.folder / "end.json").write_text('{"status": 4, "cancelled": false}')
+    assert open_job(mute.folder).message == "it ended with status 4 and without a word."
 
 
 def test_a_job_runs_once_however_many_start_it(tmp_path: Path) -> None:
