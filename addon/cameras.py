@@ -7,6 +7,8 @@ from mathutils import Matrix
 
 from ..core.camera import Camera
 from ..core.camera_blender import BlenderCamera
+from ..core.camera_fisheye import KINDS as FISHEYES
+from ..core.camera_fisheye import Fisheye, fisheye_camera
 from ..core.errors import HoloreelError
 
 _KINDS = {"ORTHO": "orthographic", "PANO": "panoramic", "CUSTOM": "custom"}
@@ -24,25 +26,42 @@ def camera_settings(
     if camera_object.type != "CAMERA":
         raise HoloreelError(f"object {camera_object.name!r} is no camera; choose a camera.")
     evaluated = camera_object.evaluated_get(depsgraph or bpy.context.evaluated_depsgraph_get())
-    data = evaluated.data
-    if data.type != "PERSP":
-        kind = _KINDS.get(data.type, data.type)
+    if evaluated.data.type != "PERSP":
+        kind = _KINDS.get(evaluated.data.type, evaluated.data.type)
         raise HoloreelError(
             f"camera {camera_object.name!r} is {kind}; only perspective cameras are supported, change its type."
         )
-    return BlenderCamera(
-        **{key: getattr(data, key) for key in _DATA},
-        **{key: getattr(scene.render, key) for key in _FORMAT},
-        matrix_world=np.array(evaluated.matrix_world, np.float64),
-        name=camera_object.name,
-    )
+    return _settings(evaluated, scene)
 
 
 def camera_from_object(
     camera_object: bpy.types.Object, scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph | None = None
 ) -> Camera:
-    """Return a camera object, with the format of `scene`, as a `Camera`. Raises as `camera_settings` does."""
+    """Return a camera object, with the format of `scene`, as a `Camera`: a pinhole, or a fisheye for a panoramic one.
+
+    Raises `HoloreelError` for an object that is no camera, and for cameras of other kinds.
+    """
+    if is_fisheye(camera_object):
+        evaluated = camera_object.evaluated_get(depsgraph or bpy.context.evaluated_depsgraph_get())
+        data = evaluated.data
+        polynomial = tuple(getattr(data, f"fisheye_polynomial_k{power}") for power in range(5))
+        lens = Fisheye(data.panorama_type, data.fisheye_fov, data.fisheye_lens, polynomial)
+        return fisheye_camera(_settings(evaluated, scene), lens)
     return camera_settings(camera_object, scene, depsgraph).to_camera()
+
+
+def is_fisheye(candidate: bpy.types.Object) -> bool:
+    """Return whether an object is a panoramic camera of one of the kinds that are a `Camera`."""
+    return candidate.type == "CAMERA" and candidate.data.type == "PANO" and candidate.data.panorama_type in FISHEYES
+
+
+def _settings(evaluated: bpy.types.Object, scene: bpy.types.Scene) -> BlenderCamera:
+    return BlenderCamera(
+        **{key: getattr(evaluated.data, key) for key in _DATA},
+        **{key: getattr(scene.render, key) for key in _FORMAT},
+        matrix_world=np.array(evaluated.matrix_world, np.float64),
+        name=evaluated.name,
+    )
 
 
 def new_camera_object(camera: Camera, collection: bpy.types.Collection) -> bpy.types.Object:
