@@ -7,6 +7,7 @@ where it lies. The .blend holds the points, never the movie.
 
 import os
 import zlib
+from contextlib import suppress
 from pathlib import Path
 
 import bpy
@@ -195,6 +196,9 @@ def _load_movie(video: FeatureVideo) -> bpy.types.Image:
     held = next((image for image in bpy.data.images if image != fresh and _is_movie(image, video.path)), None)
     if held is not None or not same:
         bpy.data.images.remove(fresh)
+    elif bpy.data.is_saved:
+        with suppress(ValueError):  # on another drive
+            fresh.filepath = bpy.path.relpath(str(video.path))  # so that folders can be moved with all that is in them
     if not same:
         raise HoloreelError(
             f"Blender decodes {video.path} to other values than were encoded: take a rung of another codec, or fetch "

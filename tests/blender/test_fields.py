@@ -310,6 +310,23 @@ def test_a_movie_that_goes_missing_is_seen_and_said(tmp_path: Path) -> None:
     assert (shown(played, 1).rgb != np.float32(BROKEN)).any(1).all()
 
 
+@pytest.mark.usefixtures("ball")
+def test_a_folder_with_the_blend_and_the_reel_can_be_moved(tmp_path: Path) -> None:
+    old, new = tmp_path / "old", tmp_path / "new"
+    old.mkdir()
+    bpy.ops.wm.save_as_mainfile(filepath=str(old / "scene.blend"))
+    reels.import_reel(bpy.context, copied(old)).name = "moved"
+    bpy.ops.wm.save_mainfile()
+    old.rename(new)
+    bpy.ops.wm.open_mainfile(filepath=str(new / "scene.blend"))
+    moved = bpy.data.objects["moved"]
+    assert fields.movie_problem(moved) is None
+    for name in ("Color", "Hide Fainter Than"):
+        set_input(reels.modifier_of(moved), name, get_input(reels.modifier_of(bpy.data.objects["ball"]), name))
+    np.testing.assert_array_equal(shown(moved, 4).rgb, shown(bpy.data.objects["ball"], 4).rgb)
+    assert fields.set_rung(moved, read_video_reel(reels.source_of(moved)), "34") == "h264:34"
+
+
 def test_another_movie_in_its_place_is_seen(ball: bpy.types.Object, tmp_path: Path) -> None:
     other = bpy.data.images.new("Other", 64, 48)
     set_input(reels.modifier_of(ball), "Movie", other)
