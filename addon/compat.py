@@ -115,6 +115,20 @@ def new_point_cloud(context: bpy.types.Context, name: str, count: int) -> bpy.ty
     return created
 
 
+NATIVE_SPLATS = "GAUSSIAN_SPLAT"  # Blender 5.3 gives point clouds a type
+
+
+def has_native_splats() -> bool:
+    """Return whether point clouds can be Gaussian splats that Blender draws itself."""
+    kinds = bpy.types.PointCloud.bl_rna.properties.get("type")
+    return kinds is not None and NATIVE_SPLATS in kinds.enum_items
+
+
+def set_native(cloud: bpy.types.PointCloud) -> None:
+    """Let Blender draw a point cloud as Gaussian splats; see `has_native_splats`."""
+    cloud.type = NATIVE_SPLATS
+
+
 # --- Nodes and materials --------------------------------------------------------------------------------------------
 
 

@@ -11,6 +11,7 @@ from ..addon.nodes.show import HULL, LINEAR, POINTS, SPLATS
 from ..addon.reels import modifier_of
 from ..operators.add_crop_box import HOLOREEL_OT_add_crop_box
 from ..operators.let_rays_through import HOLOREEL_OT_let_rays_through
+from ..operators.make_native_splats import HOLOREEL_OT_make_native_splats
 from ..operators.setup_exact_render import HOLOREEL_OT_setup_exact_render
 from .reel import SubPanel
 
@@ -31,13 +32,15 @@ class HOLOREEL_PT_look(SubPanel, bpy.types.Panel):
         for sentence in look_problems(context.scene, look, compat.get_input(modifier, "Color")):
             self.layout.label(text=sentence, icon="ERROR")
         if _shows_preview(context):
-            self.layout.label(text="Solid shading is a preview, without the reel's colors", icon="INFO")
+            self.layout.label(text="Solid shading is a preview: points without colors", icon="INFO")
         if look == POINTS:
             return
         if ends_rays_early(context.scene):
             self.layout.operator(HOLOREEL_OT_let_rays_through.bl_idname, icon="LIGHT")
         if look == SPLATS:
             self.layout.operator(HOLOREEL_OT_setup_exact_render.bl_idname, icon="RENDER_STILL")
+        if compat.has_native_splats():
+            self.layout.operator(HOLOREEL_OT_make_native_splats.bl_idname, icon="OUTLINER_OB_POINTCLOUD")
 
 
 class HOLOREEL_PT_crop(SubPanel, bpy.types.Panel):
@@ -75,7 +78,7 @@ def look_problems(scene: bpy.types.Scene, look: str, color: str) -> list[str]:
     if look == SPLATS and camera is not None and camera.type == "CAMERA" and camera.data.type in ("PANO", "CUSTOM"):
         found.append("Splats are for perspective cameras: take Hull in Cycles, or Points")
     if engine == "BLENDER_WORKBENCH":
-        found.append("Workbench shows a preview, without the reel's colors")
+        found.append("Workbench shows a preview: points without colors")
     if look == HULL and engine == compat.eevee_engine():
         found.append("Hulls are for Cycles; EEVEE shows a preview")
     if look != POINTS and ends_rays_early(scene):
