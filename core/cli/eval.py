@@ -50,8 +50,8 @@ def run(
         file: the .reel, .ply, .stgc or .splatv, or the NAME.model of a VideoRF.
         capture: folder of a capture in any layout that `holoreel info` knows.
         split: which cameras of the capture.
-        protocol: look at what this dataset's evaluation looks at, subjects over its background: rerf all frames of its
-            held-out cameras over white, humanrf a third and a fifth of them over black.
+        protocol: keep a dataset's protocol: rerf all frames of its held-out cameras over white, humanrf every third and
+            every fifth of its own over black.
         out: folder for metrics.json, a page index.html and the drawn pictures (OUT/CAMERA/FRAME.png).
         pictures: write the drawn pictures too.
         speed: measure frames per second too, by the authors' protocol and by ours.
