@@ -7,6 +7,7 @@ Features are detected where they can be; nothing outside this file asks for a ve
 from typing import Any
 
 import bpy
+from bpy_extras import anim_utils
 
 # --- Geometry Nodes modifiers ---------------------------------------------------------------------------------------
 # Up to 4.5 the inputs of a modifier are ID properties, `modifier["Socket_2"]`; later they are real properties,
@@ -81,6 +82,18 @@ def draw_input(
         layout.prop(getattr(modifier.properties.inputs, identifier), "value", text=label)
     else:
         layout.prop(modifier, f'["{identifier}"]', text=label)
+
+
+# --- Animation ------------------------------------------------------------------------------------------------------
+
+
+def find_fcurve(animated: bpy.types.ID, path: str) -> bpy.types.FCurve | None:
+    """Return the keys of a property (`path` from the data-block), None if it has none."""
+    animation = animated.animation_data
+    if animation is None or animation.action is None:
+        return None
+    channels = anim_utils.action_get_channelbag_for_slot(animation.action, animation.action_slot)
+    return None if channels is None else channels.fcurves.find(path)
 
 
 # --- Point clouds ---------------------------------------------------------------------------------------------------
@@ -161,3 +174,37 @@ def set_image_format(settings: bpy.types.ImageFormatSettings, file_format: str) 
     if hasattr(settings, "media_type"):
         settings.media_type = "MULTI_LAYER_IMAGE" if file_format == "OPEN_EXR_MULTILAYER" else "IMAGE"
     settings.file_format = file_format
+
+
+# --- Compositing ----------------------------------------------------------------------------------------------------
+
+
+def compositor_tree(scene: bpy.types.Scene) -> bpy.types.NodeTree:
+    """Return a scene's compositor nodes, made where there are none.
+
+    Up to 4.5 a scene owns them, and they end in a Composite node; later they are a node group with an output.
+    """
+    if not hasattr(scene, "compositing_node_group"):
+        scene.use_nodes = True
+        return scene.node_tree
+    if scene.compositing_node_group is None:
+        tree = bpy.data.node_groups.new(f"{scene.name} Compositing", "CompositorNodeTree")
+        tree.interface.new_socket("Image", in_out="OUTPUT", socket_type="NodeSocketColor")
+        scene.compositing_node_group = tree
+    return scene.compositing_node_group
+
+
+def compositor_output(tree: bpy.types.NodeTree) -> bpy.types.NodeSocket:
+    """Return the socket that the picture goes into, of a node made where there is none."""
+    kind = "CompositorNodeComposite" if hasattr(bpy.types, "CompositorNodeComposite") else "NodeGroupOutput"
+    node = next((node for node in tree.nodes if node.bl_idname == kind), None) or tree.nodes.new(kind)
+    return node.inputs[0]
+
+
+def set_depth_combine(node: bpy.types.Node) -> None:
+    """Let a Z Combine node lay what is nearer over what is farther by its alpha, without smoothing of edges."""
+    if "Use Alpha" in node.inputs:
+        node.inputs["Use Alpha"].default_value = True
+        node.inputs["Anti-Alias"].default_value = False
+    else:
+        node.use_alpha, node.use_antialias_z = True, False

@@ -14,6 +14,7 @@ from ..operators.reload_reel import (
     HOLOREEL_OT_store_beside,
     HOLOREEL_OT_store_inside,
 )
+from ..operators.retime import HOLOREEL_OT_key_reel_frames
 
 
 class _ReelPanel:
@@ -74,6 +75,8 @@ class HOLOREEL_PT_timeline(SubPanel, bpy.types.Panel):
         retimed = get_input(modifier_of(context.object), "Retime")
         self.inputs(context, "Retime")
         self.inputs(context, *(["Reel Frame"] if retimed else ["Start Frame", "Speed", "Offset"]))
+        if not retimed:
+            self.layout.operator(HOLOREEL_OT_key_reel_frames.bl_idname, icon="GRAPH")
         self.inputs(context, "First Frame", "Last Frame", "Repeat")
         if context.object.get(INFO, {}).get("segments", 1) == 1:
             self.inputs(context, "Frame Count")
@@ -93,8 +96,8 @@ class HOLOREEL_PT_detail(SubPanel, bpy.types.Panel):
         return modifier is not None and "Viewport Detail" in input_names(modifier.node_group)
 
     def draw(self, context: bpy.types.Context) -> None:
-        """Draw the percentages."""
-        self.inputs(context, "Viewport Detail", "Render Detail")
+        """Draw the percentages, and whether speeds are worked out."""
+        self.inputs(context, "Viewport Detail", "Render Detail", "Motion Blur")
 
 
 class HOLOREEL_PT_info(SubPanel, bpy.types.Panel):

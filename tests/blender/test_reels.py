@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from holoreel.addon import attributes, compat, reels
 from holoreel.addon.nodes.reel import DISPLAY, LINEAR, LOOKS, POINTS
+from holoreel.addon.retime import key_reel_frames
 from holoreel.addon.timeline import HOLD, LOOP, PING_PONG, Timeline
 from holoreel.core.errors import HoloreelError
 from holoreel.core.gaussians.decoder import Decoder
@@ -369,3 +370,41 @@ def test_viewport_detail_keeps_the_first(percent: float, kept: int, random_model
     compat.set_input(modifier, "Viewport Detail", 100.0)
     compat.set_input(modifier, "Render Detail", percent)
     assert len(evaluated(reel)["position"]) == 250
+
+
+def test_key_reel_frames_keeps_what_plays(random_model: Model) -> None:
+    backward, loop = Timeline(40, start=5, speed=-2, offset=30), Timeline(40, start=2, speed=0.75, repeat=LOOP)
+    for timeline in (Timeline(40, start=5, speed=0.5, first=3, last=21), backward, loop):
+        model = random_model(100)
+        reel = reels.create_reel_object(bpy.context, "reel", model, timeline)
+        show_points(reel)
+        assert key_reel_frames(bpy.context.scene, reel) == 2
+        for frame in (-10, 5, 11.5, 20, 90):
+            seek(frame)
+            now = reels.timeline_of(reel.evaluated_get(bpy.context.evaluated_depsgraph_get()))
+            assert now.retime
+            assert float(now.reel_frame(frame)) == pytest.approx(float(timeline.reel_frame(frame)), abs=1e-4)
+            assert_same(evaluated(reel), model.evaluate(float(now.time(frame))))
+        with pytest.raises(HoloreelError, match="retimed already"):
+            key_reel_frames(bpy.context.scene, reel)
+    still = reels.create_reel_object(bpy.context, "reel", random_model(3), Timeline(40, speed=0))
+    with pytest.raises(HoloreelError, match="Speed 0"):
+        key_reel_frames(bpy.context.scene, still)
+
+
+def test_key_reel_frames_adds_a_keyed_speed_up(random_model: Model) -> None:
+    scene = bpy.context.scene
+    scene.frame_end = 60
+    reel = reels.create_reel_object(bpy.context, "reel", random_model(3), Timeline(100))
+    path = compat.input_path(reels.modifier_of(reel), "Speed")
+    for frame, speed in ((1, 2.0), (41, 0.0)):
+        compat.set_input(reels.modifier_of(reel), "Speed", speed)
+        reel.keyframe_insert(path, frame=frame)
+    for key in compat.find_fcurve(reel, path).keyframe_points:
+        key.interpolation = "LINEAR"
+    assert key_reel_frames(scene, reel) == 60
+    for frame in (1, 11, 21, 41, 60):
+        seek(frame)
+        t = min(frame - 1, 40)
+        now = reels.timeline_of(reel.evaluated_get(bpy.context.evaluated_depsgraph_get()))
+        assert now.at == pytest.approx(2 * t - t * t / 40, abs=1e-3)  # slows down to a stop, never runs back
