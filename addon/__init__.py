@@ -6,9 +6,22 @@ from types import ModuleType
 
 def _modules() -> tuple[ModuleType, ...]:
     from .. import operators, panels
-    from . import checkup, commands, jobs, preferences, previews, synthesis, training, viewport
+    from . import checkup, commands, engine, jobs, preferences, previews, synthesis, training, viewport, worker
 
-    return preferences, checkup, previews, training, synthesis, jobs, viewport, commands, operators, panels
+    return (
+        preferences,
+        checkup,
+        previews,
+        training,
+        synthesis,
+        jobs,
+        viewport,
+        worker,
+        engine,
+        commands,
+        operators,
+        panels,
+    )
 
 
 def register() -> None:

@@ -115,3 +115,18 @@ def _pose(matrix_world: ArrayLike, name: str) -> Array:
     left, _, right = np.linalg.svd(axes)
     matrix[:3, :3] = left @ right
     return matrix
+
+
+def camera_from_projection(view: ArrayLike, window: ArrayLike, width: int, height: int) -> Camera:
+    """Return what a viewport of `width` × `height` pixels sees, from its OpenGL matrices (4 × 4), world to view and
+    view to clip space; the latter must be a perspective one."""
+    window, flipped = np.array(window, np.float64), _FLIP @ np.array(view, np.float64)
+    return Camera(
+        width=width,
+        height=height,
+        fx=window[0, 0] * width / 2,
+        fy=window[1, 1] * height / 2,
+        cx=(1 - window[0, 2]) * width / 2,
+        cy=(1 + window[1, 2]) * height / 2,
+        world_to_camera=flipped,
+    )

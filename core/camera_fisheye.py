@@ -27,6 +27,7 @@ Array = NDArray[np.float64]
 EQUIDISTANT, EQUISOLID, POLYNOMIAL = "FISHEYE_EQUIDISTANT", "FISHEYE_EQUISOLID", "FISHEYE_LENS_POLYNOMIAL"
 KINDS = (EQUIDISTANT, EQUISOLID, POLYNOMIAL)
 TOLERANCE_PX = 0.1  # how far the fit may be off
+NO_TERMS: tuple[float, ...] = (0.0,) * 4
 _SAMPLES = 512
 
 
@@ -51,7 +52,7 @@ def fisheye_camera(settings: BlenderCamera, fisheye: Fisheye) -> Camera:
     if not 0 < fisheye.fov <= 2 * math.pi:
         raise _error(settings, f"has the field of view {math.degrees(fisheye.fov):g}°, not one up to 360°")
     if fisheye.kind == EQUIDISTANT:
-        focal, terms = (width / fisheye.fov, height / fisheye.fov), (0.0,) * 4
+        focal, terms = (width / fisheye.fov, height / fisheye.fov), NO_TERMS
     else:
         reach = math.hypot(max(abs(cx), abs(width - cx)) / plain.fx, max(abs(cy), abs(height - cy)) / plain.fy)
         theta, radius = _curve(settings, fisheye, reach)

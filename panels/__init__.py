@@ -5,9 +5,9 @@ from types import ModuleType
 
 
 def _modules() -> tuple[ModuleType, ...]:
-    from . import field, jobs, look, reel, synth, train
+    from . import engine, field, jobs, look, reel, synth, train
 
-    return reel, field, look, synth, train, jobs
+    return reel, field, look, engine, synth, train, jobs
 
 
 def register() -> None:
