@@ -24,6 +24,7 @@ from . import attributes
 from .compat import new_point_cloud
 
 ENDLESS = 1e9  # the last segment ends at this frame
+STORED = "Holoreel Points"  # the cloud's name in a .blend beside the reel
 
 
 @dataclass(frozen=True)
@@ -69,10 +70,13 @@ def new_cloud_object(context: bpy.types.Context, name: str, points: Points) -> b
 
 def replace_points(context: bpy.types.Context, old: bpy.types.PointCloud, points: Points) -> bpy.types.PointCloud:
     """Return a new point cloud with these points, which takes the place of `old` in all objects that have it."""
-    carrier = new_cloud_object(context, old.name, points)
+    name = old.name
+    carrier = new_cloud_object(context, name, points)
     new = carrier.data
     bpy.data.objects.remove(carrier)
-    return _replace(old, new)
+    _replace(old, new)
+    new.name = name
+    return new
 
 
 def library_path(source: Path, detail: float = 100.0) -> Path:
@@ -88,22 +92,25 @@ def store_beside(cloud: bpy.types.PointCloud, path: Path) -> bpy.types.PointClou
 
     Raises `HoloreelError` if the file cannot be written.
     """
+    _rename(cloud, STORED)
     with atomic_path(path) as temporary:
         bpy.data.libraries.write(str(temporary), {cloud}, fake_user=True)
     for library in bpy.data.libraries:
         if Path(bpy.path.abspath(library.filepath)) == path:
-            library.reload()
-    with bpy.data.libraries.load(str(path), link=True, relative=bpy.data.is_saved) as (found, wanted):
-        wanted.pointclouds = found.pointclouds[:1]
+            library.reload()  # other reels show the new points as well
+    with bpy.data.libraries.load(str(path), link=True, relative=bpy.data.is_saved) as (_, wanted):
+        wanted.pointclouds = [STORED]
     return _replace(cloud, wanted.pointclouds[0])
 
 
-def store_inside(cloud: bpy.types.PointCloud) -> bpy.types.PointCloud:
+def store_inside(cloud: bpy.types.PointCloud, name: str) -> bpy.types.PointCloud:
     """Copy a linked cloud into the .blend; return the local one, which replaces it. Raises where it is missing."""
     problem = missing_library(cloud)
     if problem is not None:
         raise HoloreelError(f"{problem}: reload the reel.")
-    return cloud if cloud.library is None else cloud.make_local()
+    local = cloud if cloud.library is None else cloud.make_local()
+    local.name = name
+    return local
 
 
 def missing_library(cloud: bpy.types.PointCloud) -> str | None:
@@ -113,10 +120,15 @@ def missing_library(cloud: bpy.types.PointCloud) -> str | None:
     return f"{Path(bpy.path.abspath(cloud.library.filepath)).name} with the points is missing"
 
 
+def _rename(cloud: bpy.types.PointCloud, name: str) -> None:
+    """Give a local cloud this name exactly; another local one that has it gets a number."""
+    holder = bpy.data.pointclouds.get((name, None))
+    if holder is not None and holder != cloud:
+        holder.name = f"{name}.001"
+    cloud.name = name
+
+
 def _replace(old: bpy.types.PointCloud, new: bpy.types.PointCloud) -> bpy.types.PointCloud:
-    name = old.name
     old.user_remap(new)
     bpy.data.pointclouds.remove(old)
-    if new.library is None:
-        new.name = name
     return new

@@ -39,7 +39,7 @@ def store_beside(played: bpy.types.Object) -> None:
 def store_inside(played: bpy.types.Object) -> None:
     """Take a reel's points into the .blend. Raises `HoloreelError` where they are missing."""
     _demand_own(played)
-    clouds.store_inside(played.data)
+    clouds.store_inside(played.data, played.name)
 
 
 def problem_of(played: bpy.types.Object) -> str | None:

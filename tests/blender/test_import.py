@@ -249,3 +249,29 @@ def test_files_of_another_kind_are_not_read_into_a_reel(random_model: Model, tmp
         reload.relink_reel(bpy.context, created, tmp_path / "b.reel")
     with pytest.raises(HoloreelError, match="no reel"):
         reload.store_beside(bpy.data.objects.new("Empty", None))
+
+
+@pytest.mark.usefixtures("registered")
+def test_reels_share_the_points_beside_them(random_model: Model, tmp_path: Path) -> None:
+    path = tmp_path / "a.reel"
+    save_gaussians(path, random_model(50), fps=24, frame_start=1, frame_count=5)
+    one, two = (reels.import_reel(bpy.context, path, beside=True) for _ in range(2))
+    small = reels.import_reel(bpy.context, path, beside=True, detail=10)
+    assert one.data == two.data
+    assert [len(reel.data.points) for reel in (one, two, small)] == [50, 50, 5]
+    save_gaussians(path, random_model(80), fps=24, frame_start=1, frame_count=5)
+    reload.reload_reel(bpy.context, two)
+    assert [len(reel.data.points) for reel in (one, two, small)] == [80, 80, 5]
+    reload.store_inside(small)
+    assert [reel.data.library is None for reel in (one, two, small)] == [False, False, True]
+    assert len(bpy.data.pointclouds) == 2
+
+
+@pytest.mark.usefixtures("registered")
+def test_a_folder_that_takes_no_points_stops_the_import(random_model: Model, tmp_path: Path) -> None:
+    save_gaussians(tmp_path / "a.reel", random_model(50), fps=24, frame_start=1, frame_count=5)
+    clouds.library_path(tmp_path / "a.reel").mkdir()  # in the way
+    with pytest.raises(RuntimeError, match=r"a\.reel\.blend cannot be written"):
+        bpy.ops.holoreel.import_reel(filepath=str(tmp_path / "a.reel"), beside=True)
+    assert not bpy.data.objects
+    assert not bpy.data.pointclouds
