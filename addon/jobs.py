@@ -57,8 +57,12 @@ def start(
 ) -> Job:
     """Start a job, with `python` for its supervisor; its reel goes into a scene when it is done, if one is given.
 
-    Raises `HoloreelError`; see `core.jobs.begin`.
+    Raises `HoloreelError` where a running job makes the same, and as `core.jobs.begin` does.
     """
+    if any(job.state.alive and job.record.result == record.result for job in _jobs.values()):
+        raise HoloreelError(
+            f"{record.result} is being made by a job that runs: wait for it, or stop it in the panel Jobs."
+        )
     notes = record.notes | {"import": import_into is not None, "blend": bpy.data.filepath, "session": _session}
     job = begin(jobs_folder(), replace(record, notes=notes), python, child_environment(), prepare)
     _jobs[job.name] = job

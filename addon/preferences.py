@@ -12,12 +12,14 @@ import bpy
 from ..core.errors import HoloreelError
 from . import checkup, environment
 from .environment import PACKAGE
+from .texts import draw_text
 
 _DEVICES = (
     ("auto", "Automatic", "The graphics card where the core environment has a working CUDA, else the processor"),
     ("cpu", "Processor", "The processor, with Holoreel's own kernels"),
     ("cuda", "Graphics Card", "An NVIDIA graphics card; needs a torch for CUDA and gsplat in the core environment"),
 )
+_LETTERS = 80  # in a line
 _DEFAULTS = {"python": "", "device": "auto", "cache_mb": 2048, "log_folder": ""}
 
 
@@ -56,15 +58,15 @@ class HoloreelPreferences(bpy.types.AddonPreferences):
     def draw(self, context: bpy.types.Context) -> None:
         """Draw the core environment and how it is, then the rest."""
         layout = self.layout
-        layout.use_property_split = True
+        layout.use_property_split, layout.use_property_decorate = True, False
         layout.prop(self, "python")
         try:
             found, icon = str(core_python()), "CONSOLE"
         except HoloreelError as error:
             found, icon = str(error), "ERROR"
-        layout.label(text=found, icon=icon)
+        draw_text(layout, found, _LETTERS, icon)
         for line, icon in checkup.lines():
-            layout.label(text=line, icon=icon)
+            draw_text(layout, line, _LETTERS, icon)
         row = layout.row()
         row.operator("holoreel.check_environment", icon="CHECKMARK")
         row.operator("holoreel.create_environment", icon="ADD")

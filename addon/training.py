@@ -63,7 +63,7 @@ class HoloreelTrainSettings(bpy.types.PropertyGroup):
     )
     overwrite: bpy.props.BoolProperty(name="Overwrite", description="Replace a reel of this name")
     import_when_done: bpy.props.BoolProperty(
-        name="Import When Done", description="Import the reel into this scene once it is trained", default=True
+        name="Import It", description="Import the reel into this scene once it is trained", default=True
     )
 
     @property

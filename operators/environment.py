@@ -10,11 +10,12 @@ import bpy
 from ..addon import checkup, jobs
 from ..addon.environment import checkout, creation, default_folder
 from ..addon.preferences import core_python
+from ..addon.texts import draw_text
 from ..core.errors import HoloreelError
 from ..core.jobs import JobRecord
 from .reporting import NeedsCore, Reporting
 
-_DIALOG_WIDTH = 720
+_DIALOG_WIDTH, _DIALOG_LETTERS = 720, 100
 
 
 class HOLOREEL_OT_check_environment(NeedsCore, bpy.types.Operator):
@@ -96,17 +97,16 @@ class HOLOREEL_OT_create_environment(Reporting, bpy.types.Operator):
     def draw(self, context: bpy.types.Context) -> None:
         """Draw the paths and the exact commands."""
         layout = self.layout
-        layout.use_property_split = True
+        layout.use_property_split, layout.use_property_decorate = True, False
         for name in ("folder", "base", "package", "wheels", "cuda"):
             layout.prop(self, name)
-        column = layout.column(align=True)
         try:
             commands = self.record().commands[:-1]
         except HoloreelError as error:
-            column.label(text=str(error), icon="ERROR")
+            draw_text(layout, str(error), _DIALOG_LETTERS, "ERROR")
             return
         for command in commands:
-            column.label(text=shlex.join(command.argv), icon="CONSOLE")
+            draw_text(layout, shlex.join(command.argv), _DIALOG_LETTERS, "CONSOLE")
 
     def run(self, context: bpy.types.Context) -> None:
         """Start the job."""

@@ -4,6 +4,7 @@
 import bpy
 
 from ..addon import jobs, previews
+from ..addon.texts import draw_text, letters_in
 from ..core.jobs import Job, State
 from ..core.status import Status, preview_path
 from ..operators.jobs import (
@@ -37,7 +38,7 @@ class HOLOREEL_PT_jobs(Sidebar, bpy.types.Panel):
         """Draw a box for each job."""
         known = jobs.known()
         for job in known[:SHOWN]:
-            _draw_job(self.layout.box().column(), job)
+            _draw_job(self.layout.box().column(), job, letters_in(context.region))
         if not known:
             self.layout.label(text="No jobs", icon="INFO")
         if len(known) > SHOWN:
@@ -45,17 +46,17 @@ class HOLOREEL_PT_jobs(Sidebar, bpy.types.Panel):
         self.layout.operator(HOLOREEL_OT_refresh_jobs.bl_idname, icon="FILE_REFRESH")
 
 
-def _draw_job(column: bpy.types.UILayout, job: Job) -> None:
-    """Draw what a job is, how far it is, and what can be done with it."""
+def _draw_job(column: bpy.types.UILayout, job: Job, letters: int) -> None:
+    """Draw what a job is, how far it is, and what can be done with it, in lines of so many letters."""
     column.label(text=f"{job.record.title}: {job.state.value}", icon=_ICONS[job.state])
     if job.state.alive:
         column.progress(factor=job.status.share, text=progress_text(job.status))
     if icon := previews.icon(job.name, job.status.previews, preview_path(job.status_file)):
         column.template_icon(icon_value=icon, scale=PREVIEW_SCALE)
     if job.status.figures:
-        column.label(text=", ".join(f"{name} {text}" for name, text in job.status.figures.items()))
+        draw_text(column, ", ".join(f"{name} {text}" for name, text in job.status.figures.items()), letters)
     if job.message:
-        column.label(text=job.message, icon="ERROR")
+        draw_text(column, job.message, letters, "ERROR")
     _draw_buttons(column.row(align=True), job)
 
 

@@ -17,7 +17,7 @@ class HOLOREEL_PT_synth(Sidebar, bpy.types.Panel):
     def draw(self, context: bpy.types.Context) -> None:
         """Draw the settings and the button."""
         layout, settings = self.layout, context.scene.holoreel_synth
-        layout.use_property_split = True
+        layout.use_property_split, layout.use_property_decorate = True, False
         for name in ("out", "rig", "cameras", "size", "samples", "scene_range"):
             layout.prop(settings, name)
         if not settings.scene_range:

@@ -17,7 +17,7 @@ class HOLOREEL_PT_train(Sidebar, bpy.types.Panel):
     def draw(self, context: bpy.types.Context) -> None:
         """Draw the settings and the button."""
         layout, settings = self.layout, context.scene.holoreel_train
-        layout.use_property_split = True
+        layout.use_property_split, layout.use_property_decorate = True, False
         layout.prop(settings, "capture")
         layout.prop(settings, "out")
         layout.prop(settings, "method")
@@ -27,10 +27,9 @@ class HOLOREEL_PT_train(Sidebar, bpy.types.Panel):
             layout.prop(settings, "first_frame")
             layout.prop(settings, "last_frame")
         layout.prop(settings, "options")
-        column = layout.column(heading="If There Is One")
-        column.prop(settings, "go_on")
-        column.prop(settings, "overwrite")
-        layout.prop(settings, "import_when_done")
+        column = layout.column()
+        for name in ("go_on", "overwrite", "import_when_done"):
+            column.prop(settings, name)
         layout.operator(HOLOREEL_OT_train.bl_idname, icon="PLAY")
 
 

@@ -23,7 +23,7 @@ from holoreel.core.status import preview_path
 
 ROOT = Path(holoreel.__file__).parent
 PATIENCE = 120.0  # seconds: the machine may be busy
-SHORT = "--iterations 400 --checkpoint-every 20 --density.prune-every 50"
+SHORT = "--iterations 600 --checkpoint-every 20 --density.prune-every 50"
 
 # A stand-in for the core environment: it says that it runs, and Ctrl-C ends it.
 SLEEPER = "import time\nprint('a' + 'wake', flush=True)\ntime.sleep(60)"
@@ -92,7 +92,8 @@ def settle(job: Job) -> State:
 
 def sleeping_job(**notes: object) -> Job:
     """Start a job that does nothing for a minute."""
-    record = JobRecord("train", "Sleep", [Command("", [sys.executable, "-c", SLEEPER])], "nowhere.reel", notes=notes)
+    result = f"nowhere-{len(jobs.known())}.reel"
+    record = JobRecord("train", "Sleep", [Command("", [sys.executable, "-c", SLEEPER])], result, notes=notes)
     return jobs.start(record, Path(sys.executable))
 
 
@@ -106,7 +107,7 @@ def drawn(panel: type[bpy.types.Panel]) -> list[str]:
     layout = MagicMock()
     for part in ("box", "column", "row"):
         getattr(layout, part).return_value = layout
-    panel.draw(MagicMock(layout=layout), bpy.context)
+    panel.draw(MagicMock(layout=layout), MagicMock(**{"region.width": 300}))
     return [call.kwargs["text"] for call in layout.mock_calls if "text" in call.kwargs]
 
 
@@ -121,7 +122,7 @@ def test_a_training_shows_itself_stops_survives_a_reload_goes_on_and_imports_its
     (job,) = jobs.known()
     bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "work.blend"))
     tick_until(lambda: job.status.previews > 0)
-    assert 0 < job.status.done < job.status.total == 400
+    assert 0 < job.status.done < job.status.total == 600
     assert {"loss", "PSNR"} <= job.status.figures.keys()
     previews.icon(job.name, job.status.previews, preview_path(job.status_file))  # 0 in background mode
     assert tuple(previews._pictures[job.name].image_size) == (32, 24)
@@ -228,7 +229,7 @@ def test_a_tick_opens_a_few_small_files_for_jobs_that_run_and_none_for_others(tm
             opened.append(str(arguments[0]))
 
     sys.addaudithook(hook)
-    ended = [done_job(tmp_path, tmp_path / "x.reel", None) for _ in range(5)]
+    ended = [done_job(tmp_path, tmp_path / f"{index}.reel", None) for index in range(5)]
     tick_until(lambda: not any(job.state.alive for job in ended))
     counting = True
     assert jobs.tick() is None
@@ -315,6 +316,13 @@ def test_settings_that_cannot_work_are_refused_before_anything_starts(
         bpy.ops.holoreel.train()
     assert jobs.known() == []
     assert not preferences.log_folder().exists()
+
+
+def test_two_jobs_do_not_make_the_same(tmp_path: Path) -> None:
+    job = sleeping_job()
+    with pytest.raises(HoloreelError, match="is being made by a job that runs"):
+        jobs.start(job.record, Path(sys.executable))
+    assert jobs.known() == [job]
 
 
 def test_settings_become_flags(core: Path, tmp_path: Path) -> None:
