@@ -109,11 +109,11 @@ def test_most_important_come_first(random_model: Model) -> None:
     assert sorted(order) == list(range(500))
     assert np.all(np.diff(importance(model)[order]) <= 0)
     # By definition, integrated step by step.
-    times = (np.arange(4000) + 0.5) / 4000
+    times = (np.arange(400) + 0.5) / 400
     alive = np.array([model.take([row]).evaluate(time).opacities[0] for row in range(3) for time in times])
     two = np.sort(model.log_scales[:3], axis=1)[:, 1:].sum(axis=1)
     expected = alive.reshape(3, -1).mean(axis=1) * np.exp(0.5 * two)
-    np.testing.assert_allclose(importance(model)[:3], expected, rtol=5e-3)
+    np.testing.assert_allclose(importance(model)[:3], expected, rtol=1e-2)
 
 
 def test_scale_and_up_turn_the_whole_reel(random_model: Model, tmp_path: Path) -> None:
