@@ -8,6 +8,7 @@ where it lies. The .blend holds the points, never the movie.
 import os
 import zlib
 from contextlib import suppress
+from fractions import Fraction
 from pathlib import Path
 
 import bpy
@@ -29,6 +30,7 @@ from .reels import INFO, MODIFIER, follow_scene, modifier_of, set_timeline
 from .timeline import Timeline
 
 NON_COLOR = "Non-Color"
+SEEKING_TOLERANCE = 2e-3  # of a frame, at the end of the movie
 MAX_POINTS = 100_000_000  # of all groups together: 32 bytes each
 
 Columns = dict[str, tuple[Kind, NDArray[np.float32]]]
@@ -51,20 +53,14 @@ def add_field_reel(
     shading = reel.shade()
     columns = point_columns(reel)
     chosen, report = _available_rung(reel, rung)
-    video = reel.video(chosen)
-    lost = video.missing()
-    whole = [group for group in video.video.groups if group not in lost]
-    for group in whole or lost:
-        video.check(group)
-    if lost:
-        frames = frames_text([frame for group in lost for frame in range(group.first, group.first + group.frames)])
-        report.append(f"{video.path.name} is cut off: {frames} cannot be shown; fetch the rest of it.")
-    movie = _load_movie(video)
+    movie, frames = _load_movie(reel, chosen)
+    if frames < reel.frame_count:
+        lost = frames_text(list(range(frames, reel.frame_count)))
+        report.append(f"{reel.rungs[chosen].file} is cut off: {lost} cannot be shown; fetch the rest of it.")
     created = _create(context, name, columns, reel, shading)
     set_timeline(created, timeline)
-    modifier = modifier_of(created)
-    set_input(modifier, "Point Size", POINT_SIZE)
-    set_input(modifier, "Movie", movie)
+    set_input(modifier_of(created), "Point Size", POINT_SIZE)
+    _set_movie(created, movie, frames)
     follow_scene(created)
     if not fits(shading.shape):
         report.append(
@@ -95,8 +91,7 @@ def set_rung(played: bpy.types.Object, reel: VideoReel, rung: int | str | None =
     if modifier.node_group != field_reel(reel, reel.shade()):
         raise HoloreelError(f"{reel.path} is of another training than object '{played.name}': import it anew.")
     chosen, _ = _available_rung(reel, rung)
-    movie = _load_movie(reel.video(chosen))
-    set_input(modifier, "Movie", movie)
+    _set_movie(played, *_load_movie(reel, chosen))
     info = dict(played.get(INFO, {}))
     played[INFO] = {**info, "source": str(reel.path), "rung": rung_name(reel.rungs[chosen])}
     return rung_name(reel.rungs[chosen])
@@ -181,33 +176,53 @@ def _available_rung(reel: VideoReel, wanted: int | str | None) -> tuple[int, lis
     return find_rung(reel, there[0][0]), [f"{missing}: rung {there[0][0]} is shown instead."]
 
 
-def _load_movie(video: FeatureVideo) -> bpy.types.Image:
-    """Return the image data-block of a movie, one for all objects that play it.
+def _set_movie(played: bpy.types.Object, movie: bpy.types.Image, frames: int) -> None:
+    modifier = modifier_of(played)
+    set_input(modifier, "Movie", movie)
+    set_input(modifier, "Movie Frames", frames)
 
-    Its first picture must be the one that was encoded.
+
+def _load_movie(reel: VideoReel, rung: int) -> tuple[bpy.types.Image, int]:
+    """Return the image data-block of a rung's movie, one for all objects that play it, and how many frames it holds.
+
+    They are fewer than the reel's where it is cut off; all that is there must be what was encoded.
     """
+    video = reel.video(rung)
+    whole = video.video.groups[: len(video.video.groups) - len(video.missing())]
+    for group in whole or video.video.groups:
+        video.check(group)
     try:
         fresh = bpy.data.images.load(str(video.path))
     except RuntimeError as error:
         raise HoloreelError(f"{video.path} cannot be opened as a movie ({error}): fetch it again.") from error
     fresh.colorspace_settings.name = NON_COLOR
     fresh.alpha_mode = "NONE"
-    same = _first_crc(fresh, video.picture) == video.video.groups[0].luma_crc32
+    problem = _decoding_problem(fresh, reel, video)
     held = next((image for image in bpy.data.images if image != fresh and _is_movie(image, video.path)), None)
-    if held is not None or not same:
+    if held is not None or problem is not None:
         bpy.data.images.remove(fresh)
     elif bpy.data.is_saved:
         with suppress(ValueError):  # on another drive
             fresh.filepath = bpy.path.relpath(str(video.path))  # so that folders can be moved with all that is in them
-    if not same:
-        raise HoloreelError(
-            f"Blender decodes {video.path} to other values than were encoded: take a rung of another codec, or fetch "
-            f"the original file."
-        )
-    if held is None:
-        return fresh
-    held.reload()  # the file may have come back, or be another one by now
-    return held
+    if problem is not None:
+        raise HoloreelError(f"{video.path}: Blender {problem}.")
+    if held is not None:
+        held.reload()  # the file may have come back, or be another one by now
+    return held or fresh, sum(group.frames for group in whole)
+
+
+def _decoding_problem(movie: bpy.types.Image, reel: VideoReel, video: FeatureVideo) -> str | None:
+    """Say what Blender makes of a movie that it does not show as it was encoded; None if all is well."""
+    if _first_crc(movie, video.picture) != video.video.groups[0].luma_crc32:
+        return "decodes other values than were encoded; take a rung of another codec, or fetch the original file"
+    clip = bpy.data.movieclips.load(str(video.path))
+    taken = clip.fps
+    bpy.data.movieclips.remove(clip)
+    # It seeks by time, and takes the rate of some short movies for the nearest usual one.
+    rate = Fraction(reel.fps).limit_denominator(1001)
+    if abs(taken / rate - 1) * reel.frame_count > SEEKING_TOLERANCE:
+        return f"takes it for {taken:g} frames per second, it has {float(rate):g}; give the reel another rate"
+    return None
 
 
 def _is_movie(image: bpy.types.Image, path: Path) -> bool:

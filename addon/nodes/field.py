@@ -21,7 +21,7 @@ from .library import ensure_group
 from .show import POINTS, set_show_defaults, show, show_inputs
 from .view import View
 
-NAME, VERSION = "Holoreel Field Reel", 1
+NAME, VERSION = "Holoreel Field Reel", 2
 SAMPLE = "Holoreel Field Frame"
 FIELD_PANEL = "Field"
 PREFIX = "field_"
@@ -68,6 +68,13 @@ def _fill(tree: Tree, reel: VideoReel, shading: Shading) -> None:
     cloud = tree.geometry_input()
     mapping = timeline_inputs(tree)
     movie = tree.image_input("Movie", "The movie with the reel's features, as it lies beside the reel", FIELD_PANEL)
+    held = tree.integer_input(
+        "Movie Frames",
+        "Frames that the movie holds, fewer than the reel's if it is cut off; set when a movie is chosen",
+        reel.frame_count,
+        0,
+        FIELD_PANEL,
+    )
     view = tree.menu_input("Seen From", "The colors of a VideoRF depend on the direction of view", FIELD_PANEL)
     along = tree.vector_input(
         "Direction", "From the eye into the scene, in the reel's own axes", (0.0, 1.0, 0.0), FIELD_PANEL
@@ -80,7 +87,7 @@ def _fill(tree: Tree, reel: VideoReel, shading: Shading) -> None:
     reel_frame = Float(tree, tree.group(time(), mapping).outputs["Reel Frame"])
     frame = (reel_frame + timeline.FRAME_ROUNDING).floor().at_least(0.0).at_most(reel.frame_count - 1.0)
     cloud = tree.delete_points(cloud, _of_other_groups(tree, frame))
-    broken = _broken(tree, reel, movie, frame)
+    broken = _broken(tree, reel, movie, held, frame)
     sampled = _chain(
         tree, field_frame(reel), {"Geometry": cloud, "Movie": movie, "Frame": frame, "Minimum Opacity": cut}
     )
@@ -100,12 +107,12 @@ def _of_other_groups(tree: Tree, frame: Float) -> Boolean:
     return ((frame - first) * (last - frame)).below(-0.5)
 
 
-def _broken(tree: Tree, reel: VideoReel, movie: Image, frame: Float) -> Boolean:
+def _broken(tree: Tree, reel: VideoReel, movie: Image, held: Float, frame: Float) -> Boolean:
     """Whether the movie has no such frame of the right size; says so in the modifier."""
     height, width = reel.tiling.picture
     info = tree.node("GeometryNodeImageInfo", {"Image": movie, "Frame": frame + 1.0}).outputs
     right = (Float(tree, info["Width"]) - width).is_zero() * (Float(tree, info["Height"]) - height).is_zero()
-    right = right * (Float(tree, info["Frame Count"]) - frame).above(0.5)
+    right = right * (Float(tree, info["Frame Count"]).at_most(held) - frame).above(0.5)
     broken = right.below(0.5)
     message = "The movie of this VideoRF is missing, cut off, or another one: see Holoreel > Field"
     tree.node("GeometryNodeWarning", {"Show": broken, "Message": message}, warning_type="ERROR")

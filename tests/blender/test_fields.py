@@ -385,17 +385,32 @@ def test_the_best_rung_that_is_there_is_taken(tmp_path: Path) -> None:
         reels.import_reel(bpy.context, path)
 
 
-@pytest.mark.usefixtures("ball")
-def test_a_movie_cut_off_plays_as_far_as_it_goes(tmp_path: Path, reel: VideoReel) -> None:
+def test_a_movie_cut_off_plays_as_far_as_it_goes(ball: bpy.types.Object, tmp_path: Path, reel: VideoReel) -> None:
     path = copied(tmp_path)
     movie = tmp_path / "ball.qp18.mp4"
-    last = reel.rungs[0].video.groups[-1]
-    movie.write_bytes(movie.read_bytes()[: last.offset + 20])
-    played = reels.import_reel(bpy.context, path)
-    set_input(reels.modifier_of(played), "Color", DISPLAY)
-    assert "frames 7 to 8 cannot be shown" in played[reels.INFO]["report"]
-    assert not (shown(played, 7).rgb == np.float32(BROKEN)).all()
-    np.testing.assert_array_equal(np.unique(shown(played, 8).rgb, axis=0), [BROKEN])
+    whole = [shown(ball, frame + 1).rgb for frame in range(FRAMES)]
+    for place, group in enumerate(reel.rungs[0].video.groups[1:], start=1):
+        for share in (0.01, 0.5, 0.99):  # without its head, in the middle of its frames, all but all
+            movie.write_bytes((DATA / movie.name).read_bytes()[: group.offset + int(share * group.size)])
+            played = reels.import_reel(bpy.context, path)
+            for name in ("Color", "Hide Fainter Than"):
+                set_input(reels.modifier_of(played), name, get_input(reels.modifier_of(ball), name))
+            assert f"frames {group.first} to {FRAMES - 1} cannot be shown" in played[reels.INFO]["report"]
+            for frame in range(FRAMES):
+                seen = shown(played, frame + 1).rgb
+                if frame < group.first:
+                    np.testing.assert_array_equal(seen, whole[frame])
+                else:
+                    np.testing.assert_array_equal(np.unique(seen, axis=0), [BROKEN], err_msg=str((place, share, frame)))
+            reels.remove_reel(played)
+
+
+@pytest.mark.usefixtures("ball")
+def test_a_movie_that_blender_seeks_wrongly_is_refused(tmp_path: Path) -> None:
+    path = copied(tmp_path)
+    path.write_text(path.read_text().replace('"fps": 24.0', '"fps": 24.02'))
+    with pytest.raises(HoloreelError, match=r"takes it for 24 frames per second, it has 24\.02"):
+        reels.import_reel(bpy.context, path)
 
 
 def flip(path: Path, at: int) -> None:
@@ -426,6 +441,7 @@ def test_damaged_payloads_are_refused_and_nothing_is_added(
     assert not bpy.data.objects
     assert not bpy.data.pointclouds
     assert not bpy.data.images
+    assert not bpy.data.movieclips
 
 
 def test_a_blend_keeps_playing_and_duplicates_share_what_they_can(tmp_path: Path, ball: bpy.types.Object) -> None:
