@@ -16,7 +16,7 @@ def icon(name: str, number: int, path: Path) -> int:
         return 0
     if _numbers.get(name) != number:
         forget(name)
-        _pictures.load(name, str(path), "IMAGE", True)
+        tuple(_pictures.load(name, str(path), "IMAGE", True).image_size)  # now: else it blinks while it is loaded
         _numbers[name] = number
     return _pictures[name].icon_id
 
