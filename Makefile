@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 # `make demo` and `make test` do all their own set-up; `make setup` does it alone. Stamps make a second call start at once.
-.PHONY: help setup demo test test-slow lint core-tests blender-tests extension test-blender clean
+.PHONY: help setup demo test test-slow lint core-tests blender-tests extension test-blender docs-images clean
 .DEFAULT_GOAL := help
 
 KERNELS := $(wildcard core/render/kernels/* core/videorf/kernels/*) CMakeLists.txt __init__.py
@@ -12,6 +12,7 @@ help:
 	@echo "make setup   only the environments: .venv, .venv-bpy45, .venv-bpy52"
 	@echo "make extension                   dist/holoreel-VERSION.zip, to install in Blender"
 	@echo "make test-blender BLENDER=PATH   that zip in a real Blender"
+	@echo "make docs-images [BLENDER=PATH]  the pictures of docs/blender.md, from a finished demo"
 	@echo "make lint    ruff and mypy        make test-slow  the slow tests too        make clean"
 
 setup: .venv/.ready .venv/.kernels .venv-bpy45/.ready .venv-bpy52/.ready
@@ -65,6 +66,10 @@ extension: $(if $(BLENDER),,.venv-bpy45/.ready .venv-bpy52/.ready)
 test-blender: extension .venv/.ready .venv/.kernels
 	@[ -n "$(BLENDER)" ] || { echo "say which: make test-blender BLENDER=/path/to/blender" >&2; exit 2; }
 	BLENDER="$(abspath $(BLENDER))" .venv/bin/python -m pytest tests/real_blender
+
+# Renders by the wheels; with BLENDER, its windows too, on a virtual screen (Xvfb). FIELD names a VideoRF to show.
+docs-images: setup extension
+	.venv/bin/python scripts/docs_images.py $(if $(BLENDER),--blender "$(abspath $(BLENDER))") $(if $(FIELD),--field "$(FIELD)")
 
 clean:
 	rm -rf build demo dist .venv .venv-bpy45 .venv-bpy52

@@ -231,6 +231,8 @@ def run_one(seed: int, files: list[Path], folder: Path) -> None:
         raise AssertionError(f"sequence {seed}: {session.done}") from error
     for scene in list(bpy.data.scenes)[1:]:
         bpy.data.scenes.remove(scene)
+    if hasattr(bpy.context.scene, "compositing_node_group"):  # a part of the scene, elsewhere a data-block that it uses
+        bpy.context.scene.compositing_node_group = None
     for thing in list(bpy.data.objects):
         bpy.data.objects.remove(thing)
     for collection in list(bpy.data.collections):
