@@ -6,7 +6,7 @@ import bpy
 from . import compat, reels
 from .nodes.show import DISPLAY
 
-TRANSPARENT_BOUNCES = 512  # splats that one ray may cross; more costs only where there are more
+TRANSPARENT_BOUNCES = 1024  # surfaces that one ray may cross, a splat is one and a hull two; costs only where they are
 ENOUGH_BOUNCES = 128  # fewer are seen
 CLIP_START, CLIP_END = 0.01, 1e5
 

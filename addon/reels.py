@@ -25,15 +25,18 @@ MODIFIER = "Holoreel"
 FIELD_NAME = "Holoreel Field Reel"  # the group of a VideoRF, as `NAME` is that of Spacetime Gaussians
 INFO = "holoreel"  # custom property of a reel's object: source, kind, fps, frame_count, gaussians or points, report
 
-# Inputs of a look that follow the scene: a driver's expression and its variables. Blender numbers its render engines;
-# Workbench is the second of those that it brings along.
+# Inputs of a look that follow the scene: a driver's expression and its variables, which are 0 where there is no camera.
+# Blender numbers its render engines and kinds of cameras: 1 is Workbench, 2 a panoramic camera.
+_SIZE = {"x": "render.resolution_x", "y": "render.resolution_y", "percent": "render.resolution_percentage"}
 _FOLLOWED = {
-    f"Render {side}": (
-        "floor(pixels * percent / 100)",
-        {"pixels": f"render.resolution_{axis}", "percent": "render.resolution_percentage"},
-    )
-    for side, axis in (("Width", "x"), ("Height", "y"))
-} | {"Workbench": ("engine == 1", {"engine": "render.engine"})}
+    "Render Width": ("floor(x * percent / 100)", _SIZE),
+    "Render Height": ("floor(y * percent / 100)", _SIZE),
+    "Workbench": ("engine == 1", {"engine": "render.engine"}),
+    "Pixel Angle": (
+        "field * 100 / (max(x, y) * percent) if kind == 2 else 0",
+        {"kind": "camera.data.type", "field": "camera.data.fisheye_fov", **_SIZE},
+    ),
+}
 
 FRAME_BY_FRAME, REAL_TIME = "FRAMES", "REAL_TIME"
 
@@ -310,4 +313,5 @@ def follow_scene(played: bpy.types.Object) -> None:
             variable.type = "CONTEXT_PROP"
             variable.targets[0].context_property = "ACTIVE_SCENE"
             variable.targets[0].data_path = path
+            variable.targets[0].use_fallback_value = True
         driver.expression = expression

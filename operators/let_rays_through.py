@@ -12,7 +12,7 @@ class HOLOREEL_OT_let_rays_through(bpy.types.Operator):
     bl_idname = "holoreel.let_rays_through"
     bl_label = "Let Rays Through"
     bl_description = (
-        "Let the rays of Cycles pass through as many splats as they meet (Max and Min Transparent Bounces 512); "
+        "Let the rays of Cycles pass through as many splats as they meet (Max and Min Transparent Bounces 1024); "
         "everything else in the scene stays as it is"
     )
     bl_options = {"REGISTER", "UNDO"}

@@ -15,7 +15,7 @@ from ..operators.make_native_splats import HOLOREEL_OT_make_native_splats
 from ..operators.setup_exact_render import HOLOREEL_OT_setup_exact_render
 from .reel import SubPanel
 
-INPUTS = {SPLATS: ("Low Pass", "Near", "Follow View"), HULL: (), POINTS: ("Point Size", "Hide Fainter Than")}
+INPUTS = {SPLATS: ("Low Pass", "Near", "Follow View"), HULL: ("Low Pass",), POINTS: ("Point Size", "Hide Fainter Than")}
 
 
 class HOLOREEL_PT_look(SubPanel, bpy.types.Panel):

@@ -30,8 +30,8 @@ def points_inputs(tree: Tree) -> dict[str, Float]:
     }
 
 
-def splats_inputs(tree: Tree) -> dict[str, Float | Boolean]:
-    """Declare the inputs of the look Splats; return them by name."""
+def camera_inputs(tree: Tree) -> dict[str, Float | Boolean]:
+    """Declare what looks have to know of the camera and the picture; return them by name."""
     panel = SPLATS_PANEL
     pixels = "of the rendered picture in pixels; follows the scene's resolution by itself"
     return {
@@ -40,9 +40,6 @@ def splats_inputs(tree: Tree) -> dict[str, Float | Boolean]:
         "Low Pass": tree.float_input(
             "Low Pass", "Blur that every splat gets against aliasing, in square pixels", LOW_PASS_PX2, 0.0, panel=panel
         ),
-        "Near": tree.float_input(
-            "Near", "Splats nearer to the camera are left out, in the reel's own units", NEAR, 0.0, panel=panel
-        ),
         "Follow View": tree.boolean_input(
             "Follow View",
             "In a 3D viewport that looks through no camera, face its own view; sorting takes time while it turns",
@@ -50,6 +47,12 @@ def splats_inputs(tree: Tree) -> dict[str, Float | Boolean]:
             panel,
         ),
     }
+
+
+def near_input(tree: Tree) -> dict[str, Float]:
+    """Declare the distance that splats keep from the camera; return it by name."""
+    tooltip = "Splats nearer to the camera are left out, in the reel's own units"
+    return {"Near": tree.float_input("Near", tooltip, NEAR, 0.0, panel=SPLATS_PANEL)}
 
 
 @node_group("Holoreel sRGB to Linear", 1, "Convert one display-referred value to scene-linear")
@@ -86,7 +89,7 @@ def points(tree: Tree) -> None:
 
 
 @node_group(
-    "Holoreel Splats", 3, "Show evaluated Gaussians as the splats they were trained as, seen by the active camera"
+    "Holoreel Splats", 4, "Show evaluated Gaussians as the splats they were trained as, seen by the active camera"
 )
 def splats(tree: Tree) -> None:
     """One quad per Gaussian, parallel to the image plane (EWA splatting), far ones first.
@@ -97,7 +100,7 @@ def splats(tree: Tree) -> None:
     sorting by z is its order. Lengths are the world's, so that the object may be scaled and sheared.
     """
     cloud = tree.geometry_input()
-    inputs = splats_inputs(tree)
+    inputs = camera_inputs(tree) | near_input(tree)
     view = View(tree, inputs["Follow View"], inputs["Render Width"], inputs["Render Height"])
 
     center = tree.position()

@@ -12,9 +12,9 @@ import bpy
 
 from .builder import Boolean, Geometry, Tree
 from .crop import OFF, crop, crop_inputs
-from .hull import hull
+from .hull import hull, hull_inputs
 from .library import node_group
-from .looks import linear_color, points, points_inputs, splats, splats_inputs
+from .looks import camera_inputs, linear_color, near_input, points, points_inputs, splats
 from .view import view_camera
 
 SPLATS, HULL, POINTS = "Splats", "Hull", "Points"
@@ -33,28 +33,24 @@ LOOK_PANEL = "Look"
 
 @dataclass(frozen=True)
 class Look:
-    """One way to show points: its node group, the inputs that it declares, and what the menu says of it."""
+    """One way to show points: its node group, the inputs that it has alone, and what the menu says of it."""
 
     tooltip: str
     group: Callable[[], bpy.types.NodeTree]
     inputs: Callable[[Tree], dict[str, Any]]
 
 
-def _no_inputs(_tree: Tree) -> dict[str, Any]:
-    return {}
-
-
 LOOKS = {
     SPLATS: Look(
         "The splats the model was trained as, facing the active camera; exact in Cycles and EEVEE",
         splats,
-        splats_inputs,
+        near_input,
     ),
     HULL: Look(
         "A small closed surface around every Gaussian, for any ray: fisheye cameras, mirrors, shadows, instances. For "
         "Cycles; where Gaussians overlap, their order differs slightly from training",
         hull,
-        _no_inputs,
+        hull_inputs,
     ),
     POINTS: Look("Opaque points; fast, for any camera and render engine", points, points_inputs),
 }
@@ -72,6 +68,7 @@ def show_inputs(tree: Tree) -> dict[str, Any]:
             LOOK_PANEL,
         ),
     }
+    shown |= camera_inputs(tree)
     for look in LOOKS.values():
         shown |= look.inputs(tree)
     return shown | crop_inputs(tree)
@@ -83,7 +80,7 @@ def set_show_defaults(tree: Tree, look: str = SPLATS) -> None:
         tree.set_menu_default(name, item)
 
 
-@node_group("Holoreel Show", 2, "Crop evaluated points, choose their colors, and show them in one of the looks")
+@node_group("Holoreel Show", 3, "Crop evaluated points, choose their colors, and show them in one of the looks")
 def show_group(tree: Tree) -> None:
     """The inputs are those of `show_inputs`."""
     cloud = tree.geometry_input()

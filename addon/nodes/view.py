@@ -48,6 +48,7 @@ class View:
 
     def __init__(self, tree: Tree, follow: Boolean, width_px: Float, height_px: Float) -> None:
         """`follow` and the size of the rendered picture are inputs of a look."""
+        self.tree = tree
         chosen = tree.group(view_camera(), {"Follow View": follow}).outputs
         camera, pixel_scale = Object(tree, chosen["Camera"]), Float(tree, chosen["Pixel Scale"])
         self.exists = Boolean(tree, chosen["Is There"])
@@ -69,6 +70,15 @@ class View:
         self.pixel_x = self.tangent_x * 2.0 / width_px * pixel_scale
         self.pixel_y = self.tangent_y * 2.0 / height_px * pixel_scale
         self.orthographic = Float(tree, info.outputs["Is Orthographic"])
+
+    def pixel_at(self, point: Vector, angle: Float | None = None) -> Float:
+        """Return the size of a pixel at a point, in the object's units; `angle` is that of a pixel, 0: of the lens."""
+        offset = point - self.location
+        along = offset.dot(self.across), offset.dot(self.above), offset.dot(self.behind)
+        distance = self.tree.vector(*along).length()
+        lens = (self.pixel_x * self.pixel_y).sqrt()
+        per_distance = lens if angle is None else self.tree.choose(angle.below(1e-12), lens, angle, "FLOAT")
+        return (per_distance * (distance * (1.0 - self.orthographic) + self.orthographic)) / self.scale
 
 
 def _transform(tree: Tree, found: Object, space: str) -> Matrix:

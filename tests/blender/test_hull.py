@@ -6,7 +6,7 @@ from collections.abc import Callable
 import bpy
 import numpy as np
 import pytest
-from holoreel.addon import compat
+from holoreel.addon import compat, reels
 from holoreel.addon.exact import setup_exact_render
 from holoreel.core.gaussians.model import SpacetimeGaussians
 from holoreel.tests.blender import oracle
@@ -26,6 +26,13 @@ def sparse_model(count: int = 120, seed: int = 3) -> SpacetimeGaussians:
     model.means[:] = directions / np.linalg.norm(directions, axis=1, keepdims=True) * random.uniform(2, 4, (count, 1))
     model.log_scales[:] = np.log(random.uniform(0.05, 0.3, (count, 3)))
     return model
+
+
+def show_hulls(model: SpacetimeGaussians, low_pass: float = 0.0) -> bpy.types.Object:
+    """Put a model into the scene at the time 0.4, as it is unless there is a low-pass."""
+    played = show(model, 0.4, "Hull")
+    compat.set_input(reels.modifier_of(played), "Low Pass", low_pass)
+    return played
 
 
 def pixels(width: int, height: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -70,23 +77,28 @@ def test_hulls_can_be_placed_by_any_transform(name: str, render: Render) -> None
     resize(96, 64)
     camera = make_camera()
     model = sparse_model()
-    world = place(show(model, 0.4, "Hull"), name)
+    world = place(show_hulls(model), name)
     bpy.context.view_layer.update()
     truth = oracle.trace(model.evaluate(0.4), *pinhole_rays(camera, 96, 64, 30.0), world)
     assert_seen(render_exactly(render), truth, (64, 96))
 
 
-def test_hulls_under_a_fisheye(render: Render) -> None:
+@pytest.mark.parametrize("low_pass", [0.0, 0.3, 2.0])
+def test_hulls_under_a_fisheye(low_pass: float, render: Render) -> None:
+    """With the low-pass, Gaussians are wider by what a pixel is at their distance."""
     size, field = 80, np.radians(180)
     resize(size, size)
     camera = make_camera()
     camera.data.type, camera.data.panorama_type, camera.data.fisheye_fov = "PANO", "FISHEYE_EQUIDISTANT", field
     model = sparse_model()
-    show(model, 0.4, "Hull")
+    show_hulls(model, low_pass)
     bpy.context.view_layer.update()
     picture = render_exactly(render)
     rays, inside = fisheye_rays(camera, size, field)
-    truth = oracle.trace(model.evaluate(0.4), *rays)
+    shown = model.evaluate(0.4)
+    pixel = np.linalg.norm(shown.means, axis=1, keepdims=True) * field / size
+    shown.scales = np.sqrt(shown.scales**2 + low_pass * pixel**2)
+    truth = oracle.trace(shown, *rays)
     truth[~inside] = 0.0
     assert_seen(picture * inside.reshape(size, size, 1), truth, (size, size))
 
@@ -125,7 +137,7 @@ def test_hulls_are_seen_in_a_mirror(render: Render) -> None:
     model = sparse_model()
     model.means[:, 2] = np.abs(model.means[:, 2]) + 6.0  # above the camera, behind its back
     model.motions[:] = 0.0
-    show(model, 0.4, "Hull")
+    show_hulls(model)
     mirror = mirror_plane(-2.0, 50.0)
     mirror.data.materials.append(bpy.data.materials.new("mirror"))
     shader(mirror.data.materials[0], "ShaderNodeBsdfGlossy", Roughness=0.0, Color=(1, 1, 1, 1))
@@ -147,7 +159,7 @@ def test_hulls_cast_shadows(render: Render) -> None:
     model.means[:] = model.means * (1, 1, 0.2) + (0, 0, 5)
     model.motions[:] = 0.0
     model.features[:] = 0.0
-    show(model, 0.4, "Hull")
+    show_hulls(model)
     floor = mirror_plane(0.0, 50.0)
     floor.data.materials.append(bpy.data.materials.new("floor"))
     shader(floor.data.materials[0], "ShaderNodeBsdfDiffuse", Color=(1, 1, 1, 1))
@@ -178,7 +190,7 @@ def test_hulls_of_instances(render: Render) -> None:
     resize(96, 64)
     camera = make_camera()
     model = sparse_model(60)
-    played = show(model, 0.4, "Hull")
+    played = show_hulls(model)
     inner, outer = (bpy.data.collections.new(name) for name in ("inner", "outer"))
     bpy.context.scene.collection.objects.unlink(played)
     inner.objects.link(played)
@@ -209,7 +221,7 @@ def test_camera_inside_a_hull_sees_what_lies_ahead(render: Render) -> None:
     model = wide_model(1)
     model.means[:], model.motions[:], model.log_scales[:], model.opacity_logits[:] = (0, 0, 0.5), 0, np.log(0.6), 2.0
     model.trbf_log_scales[:] = 16
-    show(model, 0.4, "Hull")
+    show_hulls(model)
     for turned in (Matrix.Diagonal((1, -1, -1, 1)), Matrix.Identity(4)):
         camera.matrix_world = turned
         bpy.context.view_layer.update()

@@ -72,7 +72,7 @@ def add_camera(kind: str = "PERSP") -> None:
 
 
 def test_each_look_shows_its_own_settings(draw: Callable[..., Layout]) -> None:
-    own = {SPLATS: {"Low Pass", "Near", "Follow View"}, HULL: set(), POINTS: {"Point Size", "Hide Fainter Than"}}
+    own = {SPLATS: {"Low Pass", "Near", "Follow View"}, HULL: {"Low Pass"}, POINTS: {"Point Size", "Hide Fainter Than"}}
     assert set(own) == set(LOOKS)
     for look, names in own.items():
         assert set(draw("HOLOREEL_PT_look", Look=look).inputs) == {"Look", "Color"} | names
