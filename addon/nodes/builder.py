@@ -103,11 +103,6 @@ class Matrix(Value):
         node = self.tree.node("FunctionNodeTransformPoint", {"Vector": point, "Transform": self})
         return Vector(self.tree, node.outputs[0])
 
-    def turn(self, direction: "VectorLike") -> "Vector":
-        """Return a direction transformed by this: without the last column."""
-        node = self.tree.node("FunctionNodeTransformDirection", {"Direction": direction, "Transform": self})
-        return Vector(self.tree, node.outputs[0])
-
 
 class Color(Value):
     """Four numbers."""
@@ -221,6 +216,10 @@ class Vector(Value):
             return Vector(self.tree, self._math("MULTIPLY", self, other).outputs[0])
         node = self.tree.node("ShaderNodeVectorMath", {0: self, "Scale": other}, operation="SCALE")
         return Vector(self.tree, node.outputs[0])
+
+    def times_plus(self, factor: "VectorLike", addend: "VectorLike") -> "Vector":
+        """Return this · factor + addend, axis by axis, in one node."""
+        return Vector(self.tree, self._math("MULTIPLY_ADD", self, factor, addend).outputs[0])
 
     def dot(self, other: "VectorLike") -> Float:
         """Return the scalar product."""

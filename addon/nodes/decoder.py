@@ -1,5 +1,9 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The shading network Φ of a VideoRF as nodes: its products are three numbers wide, as Blender's transforms are."""
+"""The shading network Φ of a VideoRF as nodes, which calculate with three numbers at once.
+
+A unit takes one Multiply Add for each three of its inputs and a sum over the axes; transforms of vectors by matrices
+would do with fewer nodes, but take Blender three times as long.
+"""
 
 import hashlib
 
@@ -8,19 +12,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...core.videorf.shading import Shading, ShadingShape, shading_bytes
-from .builder import Float, Matrix, Tree, Vector
+from .builder import Float, Tree, Vector
 from .library import ensure_group
 
-NAME, VERSION = "Holoreel Field Colors", 1
+NAME, VERSION = "Holoreel Field Colors", 2
 WIDTH = 3  # numbers that a vector carries
-PRODUCTS_MAX = 250  # of a group: Blender takes 2 s to build as many, and a minute for a thousand
+PRODUCTS_MAX = 600  # of a group: building takes time with their square, some seconds for as many
 
 
 def fits(shape: ShadingShape) -> bool:
-    """Return whether a network is small enough for nodes; the default of training needs 72 products."""
-    blocks = -(-shape.features // WIDTH) + shape.direction_inputs // WIDTH
+    """Return whether a network is small enough for nodes; the default of training needs 210 products."""
+    inputs = -(-shape.features // WIDTH) + shape.direction_inputs // WIDTH
     units = -(-shape.hidden // WIDTH)
-    return units * (blocks + units + 1) <= PRODUCTS_MAX
+    return shape.hidden * (inputs + units) + 3 * units <= PRODUCTS_MAX
 
 
 def feature_sockets(features: int) -> list[str]:
@@ -58,33 +62,20 @@ def _fill(tree: Tree, shading: Shading) -> None:
     spare = -shape.features % WIDTH
     first = np.insert(first, [shape.features] * spare, 0.0, axis=1)  # where the last block of features is not full
     for matrix, bias in ((first, first_bias), (second, second_bias)):
-        blocks = [unit.at_least((0.0, 0.0, 0.0)) for unit in _product(tree, blocks, matrix, bias)]
-    (outputs,) = _product(tree, blocks, last, last_bias)
+        blocks = [unit.at_least((0.0, 0.0, 0.0)) for unit in _layer(tree, blocks, matrix, bias)]
+    (outputs,) = _layer(tree, blocks, last, last_bias)
     tree.output("Color", tree.vector(*(sigmoid(value) for value in outputs.axes())), "Red, green and blue, 0 to 1")
 
 
-def _product(tree: Tree, blocks: list[Vector], matrix: NDArray[np.float32], bias: NDArray[np.float32]) -> list[Vector]:
-    """Return matrix · [blocks] + bias, three rows to a vector; rows and columns to spare are 0."""
-    rows, columns = -(-len(matrix) // WIDTH) * WIDTH, len(blocks) * WIDTH
-    padded = np.zeros((rows, columns + 1), np.float32)
-    padded[: len(matrix), : matrix.shape[1]] = matrix
-    padded[: len(matrix), columns] = bias
-    sums = []
-    for three in np.split(padded, rows // WIDTH):
-        weights = np.split(three[:, :columns], len(blocks), axis=1)
-        total = _constant(tree, weights[0], three[:, columns]).transform(blocks[0])
-        for part, block in zip(weights[1:], blocks[1:], strict=True):
-            total = total + _constant(tree, part).turn(block)
-        sums.append(total)
-    return sums
-
-
-def _constant(tree: Tree, weights: NDArray[np.float32], shift: NDArray[np.float32] | None = None) -> Matrix:
-    """Return the transform v → weights (3, 3) · v + shift (3)."""
-    node = tree.node("FunctionNodeCombineMatrix")
-    columns = [*weights.T, np.zeros(WIDTH) if shift is None else shift]
-    for column, values in enumerate(columns, start=1):
-        for row, value in enumerate(values.tolist(), start=1):
-            if value != (column == row):  # what the node has by itself; setting a socket updates the whole tree
-                node.inputs[f"Column {column} Row {row}"].default_value = value
-    return Matrix(tree, node.outputs[0])
+def _layer(tree: Tree, blocks: list[Vector], matrix: NDArray[np.float32], bias: NDArray[np.float32]) -> list[Vector]:
+    """Return matrix · [blocks] + bias, three outputs to a vector; outputs and inputs to spare are 0."""
+    columns = len(blocks) * WIDTH
+    weights = np.pad(matrix, ((0, 0), (0, columns - matrix.shape[1]))).reshape(len(matrix), len(blocks), WIDTH)
+    outputs: list[Float | float] = []
+    for row, shift in zip(weights.tolist(), bias.tolist(), strict=True):
+        total: Vector | tuple[float, float, float] = (shift, 0.0, 0.0)
+        for block, factors in zip(blocks, row, strict=True):
+            total = block.times_plus(tuple(factors), total)
+        outputs.append(total.dot((1.0, 1.0, 1.0)))
+    outputs += [0.0] * (-len(outputs) % WIDTH)
+    return [tree.vector(*outputs[start : start + WIDTH]) for start in range(0, len(outputs), WIDTH)]
