@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Blender side: building blocks. Nothing is imported before `register`."""
 
+import atexit
 from types import ModuleType
 
 
@@ -28,9 +29,11 @@ def register() -> None:
     """Register operators, then the panels that show them."""
     for module in _modules():
         module.register()
+    atexit.register(unregister)  # where Blender is a module, it would wait at its end for what is left, or crash
 
 
 def unregister() -> None:
     """Take everything out again, in reverse."""
+    atexit.unregister(unregister)
     for module in reversed(_modules()):
         module.unregister()

@@ -5,10 +5,8 @@ A reel is drawn as `holoreel render` draws it: full models by their decoder, a V
 fisheye cameras included. Nothing else of the scene is drawn.
 """
 
-import atexit
 import weakref
 from collections.abc import Iterator
-from contextlib import suppress
 
 import bpy
 import numpy as np
@@ -110,11 +108,6 @@ class HOLOREEL_RE_engine(bpy.types.RenderEngine):
         except HoloreelError as error:
             self.update_stats("Holoreel", str(error))
 
-    def __del__(self) -> None:
-        view = getattr(self, "view", None)
-        if view is not None:
-            view.close()
-
 
 _views: weakref.WeakSet[View] = weakref.WeakSet()
 
@@ -185,24 +178,16 @@ def _fitting_panels() -> Iterator[type]:
                 yield panel
 
 
-def _at_exit() -> None:
-    """Take the engine out before Python ends: Blender 4.5 as a module would wait for it forever."""
-    with suppress(RuntimeError, AttributeError):  # not registered any more
-        bpy.utils.unregister_class(HOLOREEL_RE_engine)
-
-
 def register() -> None:
     """Register the engine and its settings, and let Blender's own panels show with it."""
     engine_settings.register()
     bpy.utils.register_class(HOLOREEL_RE_engine)
     for panel in _fitting_panels():
         panel.COMPAT_ENGINES.add(ENGINE)
-    atexit.register(_at_exit)
 
 
 def unregister() -> None:
     """Take all of it out again."""
-    atexit.unregister(_at_exit)
     for view in list(_views):
         view.close()
     for panel in _fitting_panels():

@@ -91,6 +91,7 @@ class View:
         self._looking: tuple[object, ...] = ()
         self._shot: Shot | None = None
         self._texture: object | None = None  # gpu.types.GPUTexture
+        self._is_polling = False
         self._engine: bpy.types.RenderEngine | None = None
 
     def changed(self) -> None:
@@ -99,7 +100,6 @@ class View:
 
     def draw(self, engine: bpy.types.RenderEngine, context: bpy.types.Context, depsgraph: bpy.types.Depsgraph) -> None:
         """Show what there is, and see to more."""
-        self._engine = engine
         view, region = context.region_data, context.region
         looking = (*map(tuple, (*view.view_matrix, *view.window_matrix)), region.width, region.height)
         if self._changed or looking != self._looking:
@@ -121,28 +121,33 @@ class View:
             self._paint(region.width, region.height)
         done = self._progress.finest == len(SHARES) and not self._progress.is_waiting
         engine.update_stats("Holoreel", "" if done else "Drawing")
-        if self._progress.is_waiting and not bpy.app.timers.is_registered(self._poll):
+        if not self._progress.is_waiting:
+            return
+        self._engine = engine
+        if not self._is_polling:
+            self._is_polling = True
             bpy.app.timers.register(self._poll, first_interval=_POLL_SECONDS)
 
     def close(self) -> None:
         """Forget everything; the viewport is gone, or shows something else now."""
-        if bpy.app.timers.is_registered(self._poll):
-            bpy.app.timers.unregister(self._poll)
         self._progress.close()
         self._texture = self._engine = None
 
     def _poll(self) -> float | None:
         """Ask for a redraw once the worker has answered."""
-        if not self._progress.is_waiting:
-            return None
-        if not self._progress.has_news:
+        if self._progress.is_waiting and not self._progress.has_news:
             return _POLL_SECONDS
+        self._is_polling = False
+        engine, self._engine = self._engine, None  # which holds this view: not longer than it takes
         try:
-            if self._engine is not None:
-                self._engine.tag_redraw()
-        except ReferenceError:  # the engine is gone
+            if engine is not None:
+                engine.tag_redraw()
+        except ReferenceError:  # the viewport shows something else by now
             self.close()
         return None
+
+    def __del__(self) -> None:
+        self._progress.close()
 
     def _paint(self, width: int, height: int) -> None:
         if self._texture is None:

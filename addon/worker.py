@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """The one worker of this Blender: started when a picture is first asked for, ended with the add-on or with Blender."""
 
-import atexit
 from pathlib import Path
 
 from ..core.worker.client import Client
@@ -42,11 +41,9 @@ def close() -> None:
 
 
 def register() -> None:
-    """See to it that the worker ends with Blender."""
-    atexit.register(close)
+    """Nothing is started before it is needed."""
 
 
 def unregister() -> None:
     """End the worker."""
-    atexit.unregister(close)
     close()
