@@ -8,6 +8,7 @@ screen (Xvfb, software OpenGL) that has the built extension in a profile of its 
 import argparse
 import json
 import os
+import shutil
 import subprocess
 import sys
 import tempfile
@@ -45,6 +46,8 @@ def main() -> None:
     reel = next(chosen.demo.glob("*.reel"), None)
     if reel is None:
         sys.exit(f"There is no finished demo in {chosen.demo}: run make demo first.")
+    if chosen.blender and shutil.which("Xvfb") is None:
+        sys.exit("Windows need a virtual screen: apt-get install xvfb, or leave --blender away.")
     chosen.out.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory() as folder:
         work = Path(folder)

@@ -159,7 +159,7 @@ def test_mutated_real_files(name: str, shared_data: Callable[[str], Path], tmp_p
     mutate_shared(shared_data(f"stg_splatv/{name}"), tmp_path, 100)
 
 
-@pytest.mark.parametrize("count", [10, pytest.param(200, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("count", [5, pytest.param(200, marks=pytest.mark.slow)])
 def test_mutated_video_reel(count: int, tmp_path: Path) -> None:
     shutil.copytree(FIELD, tmp_path / "field")
     path = tmp_path / "field" / "ball.reel"
