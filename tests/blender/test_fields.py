@@ -5,7 +5,8 @@ import shutil
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import NamedTuple
+from types import SimpleNamespace
+from typing import Any, NamedTuple
 
 import bpy
 import holoreel
@@ -334,6 +335,53 @@ def test_another_movie_in_its_place_is_seen(ball: bpy.types.Object, tmp_path: Pa
     set_input(reels.modifier_of(ball), "Movie", None)
     np.testing.assert_array_equal(np.unique(shown(ball, 3).rgb, axis=0), [BROKEN])
     assert "No movie" in str(fields.movie_problem(ball))
+    (warning,) = reels.modifier_of(ball).node_warnings
+    assert warning.type == "ERROR"
+    assert "The movie of this VideoRF is missing" in warning.message
+
+
+class Layout:
+    """Stands for a layout: keeps the texts that are drawn."""
+
+    def __init__(self) -> None:
+        self.texts: list[str] = []
+
+    def label(self, text: str, icon: str) -> None:
+        assert icon in bpy.types.UILayout.bl_rna.functions["label"].parameters["icon"].enum_items
+        self.texts.append(text)
+
+    def column(self, align: bool) -> "Layout":
+        assert align
+        return self
+
+    def operator_menu_enum(self, _operator: str, _name: str, text: str, icon: str) -> None:
+        self.label(text, icon)
+
+    def prop(self, data: Any, name: str, text: str) -> None:
+        assert hasattr(data, name) or data.path_resolve(name) is not None
+        self.texts.append(text)
+
+
+def test_the_panel_shows_what_matters(ball: bpy.types.Object) -> None:
+    holoreel.register()
+    try:
+        kind = bpy.types.HOLOREEL_PT_field
+
+        def drawn() -> list[str]:
+            host = SimpleNamespace(layout=Layout())
+            host.inputs = lambda context, *names: kind.inputs(host, context, *names)
+            region = SimpleNamespace(width=900)
+            kind.draw(host, SimpleNamespace(object=ball, scene=bpy.context.scene, region=region))
+            return host.layout.texts
+
+        add_camera((0, -5, 0), Euler((1.5, 0, 0)))
+        assert drawn() == ["ball.qp18.mp4", "Rate h264:18", "Movie", "Seen From", "Minimum Opacity"]
+        set_input(reels.modifier_of(ball), "Seen From", DIRECTION)
+        assert "Direction" in drawn()
+        set_input(reels.modifier_of(ball), "Movie", None)
+        assert "No movie" in drawn()[0]
+    finally:
+        holoreel.unregister()
 
 
 @pytest.mark.usefixtures("ball")
