@@ -7,6 +7,7 @@ from ..addon.compat import get_input
 from ..addon.fields import field_modifier, movie_of, movie_problem
 from ..addon.nodes.field import DIRECTION
 from ..addon.reels import INFO
+from ..addon.texts import draw_text, letters_in
 from ..operators.choose_rung import HOLOREEL_OT_choose_rung
 from .reel import SubPanel
 
@@ -26,7 +27,7 @@ class HOLOREEL_PT_field(SubPanel, bpy.types.Panel):
         """Say which movie plays, or why none does; draw the settings."""
         played, layout = context.object, self.layout
         if (problem := movie_problem(played)) is not None:
-            layout.label(text=problem, icon="ERROR")
+            draw_text(layout, problem, letters_in(context.region), "ERROR")
         elif (movie := movie_of(played)) is not None:
             layout.label(text=bpy.path.basename(movie.filepath), icon="FILE_MOVIE")
         name = played.get(INFO, {}).get("rung", "")

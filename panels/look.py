@@ -9,6 +9,7 @@ from ..addon.exact import ends_rays_early
 from ..addon.nodes.crop import OFF
 from ..addon.nodes.show import HULL, LINEAR, POINTS, SPLATS
 from ..addon.reels import modifier_of
+from ..addon.texts import draw_text, letters_in
 from ..operators.add_crop_box import HOLOREEL_OT_add_crop_box
 from ..operators.let_rays_through import HOLOREEL_OT_let_rays_through
 from ..operators.make_native_splats import HOLOREEL_OT_make_native_splats
@@ -30,9 +31,11 @@ class HOLOREEL_PT_look(SubPanel, bpy.types.Panel):
         look = compat.get_input(modifier, "Look")
         self.inputs(context, "Look", *INPUTS.get(look, ()), "Color")
         for sentence in look_problems(context.scene, look, compat.get_input(modifier, "Color")):
-            self.layout.label(text=sentence, icon="ERROR")
+            draw_text(self.layout, sentence, letters_in(context.region), "ERROR")
         if _shows_preview(context):
-            self.layout.label(text="Solid shading is a preview: points without colors", icon="INFO")
+            draw_text(
+                self.layout, "Solid shading is a preview: points without colors", letters_in(context.region), "INFO"
+            )
         if look == POINTS:
             return
         if ends_rays_early(context.scene):
@@ -63,7 +66,7 @@ class HOLOREEL_PT_crop(SubPanel, bpy.types.Panel):
         if compat.get_input(modifier, "Crop") != OFF:
             self.inputs(context, "Crop Object")
         if problem := crop_problem(context.object):
-            self.layout.label(text=problem, icon="ERROR")
+            draw_text(self.layout, problem, letters_in(context.region), "ERROR")
         self.layout.operator(HOLOREEL_OT_add_crop_box.bl_idname, icon="CUBE")
 
 

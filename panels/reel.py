@@ -6,6 +6,7 @@ import bpy
 from ..addon.compat import draw_input, get_input, input_names
 from ..addon.reels import INFO, modifier_of, source_of, summary
 from ..addon.reload import is_field, problem_of
+from ..addon.texts import draw_text, letters_in
 from ..core.errors import HoloreelError
 from ..operators.import_reel import HOLOREEL_OT_import_reel
 from ..operators.reload_reel import (
@@ -57,7 +58,7 @@ class HOLOREEL_PT_reel(_ReelPanel, bpy.types.Panel):
             self.layout.prop(context.object, "name", text="", icon="POINTCLOUD_DATA")
             problem = problem_of(context.object)
             if problem is not None:
-                self.layout.label(text=problem, icon="ERROR")
+                draw_text(self.layout, problem, letters_in(context.region), "ERROR")
                 row = self.layout.row(align=True)
                 row.operator(HOLOREEL_OT_reload_reel.bl_idname, text="Reload", icon="FILE_REFRESH")
                 row.operator(HOLOREEL_OT_relink_reel.bl_idname, text="Relink", icon="FILE_FOLDER")
@@ -115,12 +116,12 @@ class HOLOREEL_PT_info(SubPanel, bpy.types.Panel):
             self.layout.label(text="Made by a script")
             return
         column = self.layout.column(align=True)
-        self._source(column, played)
+        self._source(column, context)
         column.label(text=summary(played).partition(": ")[2])
         if info.get("segments", 1) > 1:
             column.label(text=f"{info['segments']} segments")
         for sentence in filter(None, info["report"].split("\n")):
-            column.label(text=sentence, icon="INFO")
+            draw_text(column, sentence, letters_in(context.region), "INFO")
         row = self.layout.row(align=True)
         row.operator(HOLOREEL_OT_reload_reel.bl_idname, text="Reload", icon="FILE_REFRESH")
         row.operator(HOLOREEL_OT_relink_reel.bl_idname, text="Relink", icon="FILE_FOLDER")
@@ -129,11 +130,12 @@ class HOLOREEL_PT_info(SubPanel, bpy.types.Panel):
             store = HOLOREEL_OT_store_inside if linked else HOLOREEL_OT_store_beside
             self.layout.operator(store.bl_idname, icon="PACKAGE" if linked else "UGLYPACKAGE")
 
-    def _source(self, column: bpy.types.UILayout, played: bpy.types.Object) -> None:
+    def _source(self, column: bpy.types.UILayout, context: bpy.types.Context) -> None:
         try:
-            column.label(text=str(source_of(played)), icon="FILE")
+            text, icon = str(source_of(context.object)), "FILE"
         except HoloreelError as error:
-            column.label(text=str(error), icon="ERROR")
+            text, icon = str(error), "ERROR"
+        draw_text(column, text, letters_in(context.region), icon)
 
 
 CLASSES = (HOLOREEL_PT_reel, HOLOREEL_PT_timeline, HOLOREEL_PT_detail, HOLOREEL_PT_info)

@@ -29,6 +29,11 @@ class Layout:
         assert icon in bpy.types.UILayout.bl_rna.functions["label"].parameters["icon"].enum_items
         self.labels.append(text)
 
+    def column(self, align: bool) -> "Layout":
+        """Below each other."""
+        assert align
+        return self
+
     def operator(self, name: str, icon: str) -> None:
         """Keep a button."""
         assert icon in bpy.types.UILayout.bl_rna.functions["operator"].parameters["icon"].enum_items
@@ -52,7 +57,8 @@ def draw(random_model: Callable[..., SpacetimeGaussians]) -> Iterator[Callable[.
             compat.set_input(reels.modifier_of(reel), name.replace("_", " "), value)
         layout, kind = Layout(), getattr(bpy.types, panel)
         space = SimpleNamespace(shading=SimpleNamespace(type=shading))
-        context = SimpleNamespace(object=reel, scene=bpy.context.scene, space_data=space)
+        region = SimpleNamespace(width=900)
+        context = SimpleNamespace(object=reel, scene=bpy.context.scene, space_data=space, region=region)
         assert kind.poll(context)
         host = SimpleNamespace(layout=layout)
         host.inputs = lambda context, *names: kind.inputs(host, context, *names)
