@@ -24,7 +24,7 @@ from ..core.videorf.shading import Shading
 from .attributes import Kind
 from .compat import get_input, new_point_cloud, set_input
 from .nodes.decoder import fits
-from .nodes.field import FIRST, LAST, NAME, POINT_SIZE, UV, field_reel
+from .nodes.field import FIRST, LAST, NAME, POINT_SIZE, UV, field_reel, plays
 from .nodes.library import is_tagged
 from .reels import INFO, MODIFIER, follow_scene, modifier_of, set_timeline
 from .timeline import Timeline
@@ -88,7 +88,7 @@ def set_rung(played: bpy.types.Object, reel: VideoReel, rung: int | str | None =
     modifier = field_modifier(played)
     if modifier is None:
         raise HoloreelError(f"object '{played.name}' plays no VideoRF: choose one that does.")
-    if modifier.node_group != field_reel(reel, reel.shade()):
+    if not plays(modifier.node_group, reel):
         raise HoloreelError(f"{reel.path} is of another training than object '{played.name}': import it anew.")
     chosen, _ = _available_rung(reel, rung)
     _set_movie(played, *_load_movie(reel, chosen))

@@ -17,7 +17,7 @@ from ..compat import set_wildcard
 from .builder import Boolean, Float, Geometry, Image, Tree, Value, Vector
 from .decoder import WIDTH, decoder, feature_sockets, fits, sigmoid
 from .evaluation import time, timeline_inputs
-from .library import ensure_group
+from .library import TAG, ensure_group
 from .show import POINTS, set_show_defaults, show, show_inputs
 from .view import View
 
@@ -59,9 +59,18 @@ def field_frame(reel: VideoReel) -> bpy.types.NodeTree:
     return ensure_group(SAMPLE, _version(reel), tooltip, lambda tree: _fill_frame(tree, reel))
 
 
+def plays(group: bpy.types.NodeTree, reel: VideoReel) -> bool:
+    """Return whether a group was built, in whatever version, for the training that a reel is of."""
+    return str(group.get(TAG, "")).partition("-")[2] == _training(reel)
+
+
 def _version(reel: VideoReel) -> str:
-    """Everything that is a constant in the groups decides it, and the length of the reel."""
-    return f"{VERSION}-{reel.meaning[:16]}-{reel.frame_count}"
+    return f"{VERSION}-{_training(reel)}"
+
+
+def _training(reel: VideoReel) -> str:
+    """Return what tells all that is a constant in the groups: the reel's meaning and its length."""
+    return f"{reel.meaning[:16]}-{reel.frame_count}"
 
 
 def _fill(tree: Tree, reel: VideoReel, shading: Shading) -> None:

@@ -399,6 +399,11 @@ def test_rungs_are_chosen_on_import_and_later(reel: VideoReel) -> None:
     assert len(shown(played, FRAMES).opacity) != len(expected)
     with pytest.raises(HoloreelError, match="no rung 20"):
         fields.set_rung(played, reel, "20")
+    groups = len(bpy.data.node_groups)
+    for other in (replace(reel, shading_sha256="0" * 64), replace(reel, groups=reel.groups[:-1])):
+        with pytest.raises(HoloreelError, match="of another training than object 'ball"):
+            fields.set_rung(played, other)
+    assert len(bpy.data.node_groups) == groups
     with pytest.raises(HoloreelError, match="plays no VideoRF"):
         fields.set_rung(add_camera((0, 0, 0), Euler()), reel)
 
