@@ -27,9 +27,12 @@ def _modules() -> tuple[ModuleType, ...]:
 
 def register() -> None:
     """Register operators, then the panels that show them."""
+    import bpy
+
     for module in _modules():
         module.register()
-    atexit.register(unregister)  # where Blender is a module, it would wait at its end for what is left, or crash
+    if bpy.app.module:  # at its end it would wait for what is left, or crash; the program Blender sees to that itself
+        atexit.register(unregister)
 
 
 def unregister() -> None:

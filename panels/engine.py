@@ -5,10 +5,16 @@ import bpy
 
 from ..addon.engine import ENGINE
 from ..addon.engine_settings import COLOR, LINEAR
+from ..core.camera_fisheye import EQUIDISTANT, EQUISOLID, POLYNOMIAL
 from ..operators.setup_composite import HOLOREEL_OT_setup_composite
 from ..operators.setup_engine import HOLOREEL_OT_setup_engine
 
 EXACT_UNDER = {True: "Standard", False: "Raw"}
+FISHEYE_SETTINGS = {
+    EQUIDISTANT: ("fisheye_fov",),
+    EQUISOLID: ("fisheye_lens", "fisheye_fov"),
+    POLYNOMIAL: ("fisheye_fov", *(f"fisheye_polynomial_k{power}" for power in range(5))),
+}
 
 
 class _EnginePanel:
@@ -46,8 +52,8 @@ class HOLOREEL_PT_engine(_EnginePanel, bpy.types.Panel):
         column.prop(settings, "background")
         if settings.background == COLOR:
             column.prop(settings, "background_color", text="")
-        column = layout.column(heading="VideoRF")
-        column.prop(settings, "quality", text="Quality")
+        column = layout.column(align=True)
+        column.prop(settings, "quality", text="VideoRF Quality")
         column.prop(settings, "viewport_quality", text="Viewport")
 
 
@@ -65,6 +71,28 @@ class HOLOREEL_PT_engine_passes(_EnginePanel, bpy.types.Panel):
         column = layout.column(heading="Include")
         column.prop(context.view_layer, "use_pass_z", text="Depth")
         column.prop(context.scene.holoreel_engine, "use_pass_alpha")
+
+
+class HOLOREEL_PT_fisheye(_EnginePanel, bpy.types.Panel):
+    """The lens of a panoramic camera, which Blender itself shows for Cycles alone."""
+
+    bl_label = "Fisheye"
+    bl_context = "data"
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        """Only for panoramic cameras with this engine."""
+        return super().poll(context) and context.camera is not None and context.camera.type == "PANO"
+
+    def draw(self, context: bpy.types.Context) -> None:
+        """Draw what the kind of lens has."""
+        layout, camera = self.layout, context.camera
+        layout.use_property_split = True
+        layout.prop(camera, "panorama_type")
+        if camera.panorama_type not in FISHEYE_SETTINGS:
+            layout.label(text="Holoreel draws fisheye lenses alone", icon="ERROR")
+        for name in FISHEYE_SETTINGS.get(camera.panorama_type, ()):
+            layout.prop(camera, name)
 
 
 class HOLOREEL_PT_rendering(bpy.types.Panel):
@@ -86,6 +114,6 @@ class HOLOREEL_PT_rendering(bpy.types.Panel):
         layout.operator(HOLOREEL_OT_setup_composite.bl_idname, icon="NODE_COMPOSITING")
 
 
-CLASSES = (HOLOREEL_PT_engine, HOLOREEL_PT_engine_passes, HOLOREEL_PT_rendering)
+CLASSES = (HOLOREEL_PT_engine, HOLOREEL_PT_engine_passes, HOLOREEL_PT_fisheye, HOLOREEL_PT_rendering)
 
 register, unregister = bpy.utils.register_classes_factory(CLASSES)
