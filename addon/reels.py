@@ -2,18 +2,19 @@
 """Reels as Blender objects: a point cloud with a model's parameters, and a modifier that plays it."""
 
 import math
+import re
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Protocol, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
 import bpy
 from mathutils import Matrix
 
 from ..core.errors import HoloreelError
 from ..core.gaussians.model import SpacetimeGaussians
-from ..core.reel import VIDEORF, Loaded, load_segments, reel_kind
+from ..core.reel import VIDEORF, Loaded, load_gaussians, load_segments, reel_kind
 from ..core.videorf.package import VideoReel, read_video_reel
 from . import clouds
 from .compat import get_input, input_names, input_path, set_input
@@ -53,6 +54,9 @@ TIMELINE_INPUTS = {
     "at": "Reel Frame",
 }
 
+MAX_SENTENCES = 8  # about all files of a sequence
+_WORDS = re.compile(r"(\d+)")
+
 FROM_FILE = "FILE"
 # Quarter turns that bring the axis that points up in the file onto Blender's Z.
 UPRIGHT = {
@@ -68,24 +72,14 @@ UPRIGHT = {
 Read: TypeAlias = list[Loaded] | VideoReel
 
 
-class Clip(Protocol):
+class Clip(NamedTuple):
     """What the timeline asks of a reel of either kind."""
 
-    @property
-    def path(self) -> Path:
-        """Its file."""
-
-    @property
-    def frame_start(self) -> int:
-        """The number of its first frame."""
-
-    @property
-    def fps(self) -> float:
-        """Frames per second."""
-
-    @property
-    def frame_count(self) -> int:
-        """How many frames there are."""
+    path: Path
+    fps: float
+    frame_start: int
+    frame_count: int
+    up: str | None
 
 
 @dataclass(frozen=True)
@@ -127,9 +121,38 @@ def read(path: str | Path) -> Read:
     return load_segments(path)
 
 
+def read_sequence(paths: Sequence[Path]) -> list[Loaded]:
+    """Read files of Gaussians as the frames of one reel, in the natural order of their names.
+
+    Raises `HoloreelError` where a file cannot be read, or is a reel and so has frames of its own.
+    """
+    paths = sorted(paths, key=lambda path: [int(word) if word.isdigit() else word for word in _WORDS.split(path.name)])
+    for path in paths:
+        if path.suffix.lower() == ".reel":
+            raise HoloreelError(f"{path} is a reel and no single frame: import it without Sequence.")
+    parts = [load_gaussians(path) for path in paths]
+    said = [f"{len(parts)} files are the frames of one reel, at {parts[0].fps:g} frames per second."]
+    said += [sentence.replace(part.path.name, "a file") for part in parts for sentence in part.report[1:]]
+    report = list(dict.fromkeys(said))
+    if len(report) > MAX_SENTENCES:
+        report = [*report[:MAX_SENTENCES], f"{len(report) - MAX_SENTENCES} more sentences like these."]
+    return [
+        replace(part, frame_start=index, frame_count=1, report=report if index == 0 else [])
+        for index, part in enumerate(parts)
+    ]
+
+
+def clip_of(found: Read) -> Clip:
+    """Return what the timeline asks of what `read` or `read_sequence` has found."""
+    if isinstance(found, VideoReel):
+        return Clip(found.path, found.fps, found.frame_start, found.frame_count, found.up)
+    first = found[0]
+    return Clip(first.path, first.fps, first.frame_start, sum(part.frame_count for part in found), first.up)
+
+
 def add_reel(context: bpy.types.Context, found: Read, options: Options) -> bpy.types.Object:
-    """Return a new object that plays what `read` has found."""
-    clip: Clip = found if isinstance(found, VideoReel) else (found[0].reel or found[0])
+    """Return a new object that plays what `read` or `read_sequence` has found."""
+    clip = clip_of(found)
     start = options.start
     if start is None:
         start = clip.frame_start if clip.path.suffix.lower() == ".reel" else context.scene.frame_start
@@ -145,14 +168,9 @@ def add_reel(context: bpy.types.Context, found: Read, options: Options) -> bpy.t
         created = _add_gaussians(context, found, timeline, options)
     remember_source(created, clip.path)
     if options.up is not None or options.scale != 1.0:
-        axis = "Z" if options.up is None else (found_up(found) or "Z") if options.up == FROM_FILE else options.up
+        axis = "Z" if options.up is None else (clip.up or "Z") if options.up == FROM_FILE else options.up
         created.matrix_world = UPRIGHT[axis] @ Matrix.Scale(options.scale, 4)
     return created
-
-
-def found_up(found: Read) -> str | None:
-    """Return the axis that a file says points up, None where it does not say."""
-    return found.up if isinstance(found, VideoReel) else found[0].up
 
 
 def _add_gaussians(
@@ -172,9 +190,11 @@ def _add_gaussians(
 
 def describe(parts: Sequence[Loaded], detail: float) -> dict[str, Any]:
     """Return what `INFO` holds of Spacetime Gaussians."""
-    clip = parts[0].reel or parts[0]
+    clip = clip_of(parts)
+    files = [part.path.name for part in parts] if parts[-1].path != clip.path else []
     return {
         "source": str(clip.path),
+        "files": "\n".join(files),  # of a sequence
         "kind": parts[0].kind,
         "fps": clip.fps,
         "frame_count": clip.frame_count,

@@ -10,7 +10,7 @@ from ..core.reel import VIDEORF, load_segments, reel_kind
 from ..core.videorf.package import read_video_reel
 from . import clouds
 from .compat import get_input, set_input
-from .reels import INFO, describe, modifier_of, remember_source, source_of
+from .reels import INFO, describe, modifier_of, read_sequence, remember_source, source_of
 
 KIND_VIDEORF = "videorf"
 
@@ -25,7 +25,10 @@ def reload_reel(context: bpy.types.Context, played: bpy.types.Object) -> list[st
 
 
 def relink_reel(context: bpy.types.Context, played: bpy.types.Object, path: Path) -> list[str]:
-    """Let a reel come from another file from now on, as `reload_reel` does from the same."""
+    """Let a reel come from another file from now on, as `reload_reel` does from the same.
+
+    Of a sequence, that is the first file; the others must lie beside it under their old names.
+    """
     return _load(context, played, path)
 
 
@@ -66,7 +69,8 @@ def _load(context: bpy.types.Context, played: bpy.types.Object, path: Path) -> l
         set_rung(played, read_video_reel(path), played[INFO].get("rung"))
         remember_source(played, path)
         return []
-    parts = load_segments(path)
+    files = list(filter(None, str(played[INFO].get("files", "")).split("\n")))
+    parts = read_sequence([path.with_name(name) for name in files]) if files else load_segments(path)
     detail = _detail(played)
     beside = played.data.library is not None
     cloud = clouds.replace_points(context, played.data, clouds.join(parts, detail))

@@ -30,6 +30,14 @@ class HOLOREEL_OT_import_reel(bpy.types.Operator, ImportHelper):
     files: bpy.props.CollectionProperty(type=bpy.types.OperatorFileListElement, options={"HIDDEN", "SKIP_SAVE"})
     directory: bpy.props.StringProperty(subtype="DIR_PATH", options={"HIDDEN", "SKIP_SAVE"})
 
+    sequence: bpy.props.BoolProperty(
+        name="Sequence",
+        description=(
+            "Take several .ply, .stgc or .splatv files as the frames of one reel, in the order of their names; "
+            "otherwise each becomes a reel"
+        ),
+        default=False,
+    )
     start_at: bpy.props.EnumProperty(
         name="Start At",
         description="The scene frame that shows the first frame of the reel",
@@ -111,7 +119,9 @@ class HOLOREEL_OT_import_reel(bpy.types.Operator, ImportHelper):
         """Read all files, then add an object for each; if a file is refused, nothing is added."""
         added: list[bpy.types.Object] = []
         try:
-            found = [reels.read(path) for path in self._paths()]
+            paths = self._paths()
+            together = self.sequence and len(paths) > 1
+            found = [reels.read_sequence(paths)] if together else [reels.read(path) for path in paths]
             for one in found:
                 added.append(reels.add_reel(context, one, self._options(context.scene)))
         except HoloreelError as error:

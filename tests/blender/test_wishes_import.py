@@ -68,6 +68,33 @@ def test_an_ordinary_splat_ply_is_taken_and_called_what_it_is(tmp_path: Path) ->
         assert sorted(positions(reel)[:, 0]) == list(range(40))
 
 
+def test_ply_sequences_play_as_one_reel(random_model: Model, tmp_path: Path) -> None:
+    """Frames 2 and 10 in their natural order, of different sizes; found and read again from elsewhere."""
+    folder = tmp_path / "old"
+    folder.mkdir()
+    names = ["take 2.ply", "take 10.ply", "take 11.ply"]
+    models = [random_model(count, count) for count in (30, 50, 20)]
+    for name, model in zip(names, models, strict=True):
+        write_ply(folder / name, model)
+    files = [{"name": name} for name in sorted(names)]
+    bpy.ops.holoreel.import_reel(directory=str(folder), files=files, sequence=True)
+    reel = bpy.context.object
+    assert len(bpy.data.objects) == 1
+    assert "3 files are the frames" in reel[reels.INFO]["report"]
+    assert reels.timeline_of(reel).frame_count == 3
+    folder.rename(tmp_path / "new")
+    assert bpy.ops.holoreel.relink_reel(filepath=str(tmp_path / "new" / names[0])) == {"FINISHED"}
+    show_points(reel)
+    for frame, model, time in ((-5, models[0], 0), (1, models[0], 0), (2.5, models[1], 0.5), (3, models[2], 0)):
+        bpy.context.scene.frame_set(int(np.floor(frame)), subframe=frame % 1)
+        truth = model.evaluate(time)
+        expected, found = truth.take(truth.alive).means, positions(reel)
+        np.testing.assert_allclose(np.sort(found, axis=0), np.sort(expected, axis=0), atol=1e-5)
+    save_gaussians(tmp_path / "new" / "b.reel", models[0], fps=24, frame_start=1, frame_count=2)
+    with pytest.raises(RuntimeError, match=r"b\.reel is a reel"):
+        bpy.ops.holoreel.import_reel(directory=str(tmp_path / "new"), files=[*files, {"name": "b.reel"}], sequence=True)
+
+
 def test_a_ply_of_plain_points_is_refused_with_the_reason(tmp_path: Path) -> None:
     write_vertices(tmp_path / "points.ply", np.zeros(9, [(name, "f4") for name in ("x", "y", "z", "t", "s")]))
     with pytest.raises(RuntimeError, match="PLY of plain points"):
