@@ -309,7 +309,10 @@ def timeline_of(played: bpy.types.Object) -> Timeline:
 def set_timeline(played: bpy.types.Object, timeline: Timeline) -> None:
     """Set the mapping of the scene's frames to a reel's time."""
     modifier = modifier_of(played)
+    there = input_names(modifier.node_group)
     for field, name in TIMELINE_INPUTS.items():
+        if name not in there:
+            continue
         value = timeline.last_frame if field == "last" else getattr(timeline, field)
         set_input(modifier, name, value)
 

@@ -3,8 +3,8 @@
 
 import bpy
 
-from ..addon.compat import draw_input, get_input, input_names
-from ..addon.reels import INFO, modifier_of, source_of, summary
+from ..addon.compat import draw_input, input_names
+from ..addon.reels import INFO, modifier_of, source_of, summary, timeline_of
 from ..addon.reload import is_field, problem_of
 from ..addon.texts import draw_text, letters_in
 from ..core.errors import HoloreelError
@@ -37,11 +37,13 @@ class SubPanel(_ReelPanel):
         return modifier_of(context.object) is not None
 
     def inputs(self, context: bpy.types.Context, *names: str) -> None:
-        """Draw inputs of the active reel, one below the other."""
+        """Draw inputs of the active reel, one below the other; reels of older files may lack some."""
         self.layout.use_property_split = True
         modifier = modifier_of(context.object)
+        there = input_names(modifier.node_group)
         for name in names:
-            draw_input(self.layout, modifier, name)
+            if name in there:
+                draw_input(self.layout, modifier, name)
 
 
 class HOLOREEL_PT_reel(_ReelPanel, bpy.types.Panel):
@@ -73,7 +75,7 @@ class HOLOREEL_PT_timeline(SubPanel, bpy.types.Panel):
 
     def draw(self, context: bpy.types.Context) -> None:
         """Draw the mapping."""
-        retimed = get_input(modifier_of(context.object), "Retime")
+        retimed = timeline_of(context.object).retime
         self.inputs(context, "Retime")
         self.inputs(context, *(["Reel Frame"] if retimed else ["Start Frame", "Speed", "Offset"]))
         if not retimed:

@@ -408,3 +408,18 @@ def test_key_reel_frames_adds_a_keyed_speed_up(random_model: Model) -> None:
         t = min(frame - 1, 40)
         now = reels.timeline_of(reel.evaluated_get(bpy.context.evaluated_depsgraph_get()))
         assert now.at == pytest.approx(2 * t - t * t / 40, abs=1e-3)  # slows down to a stop, never runs back
+
+
+def test_reels_of_older_files_keep_what_they_have(random_model: Model) -> None:
+    """Their node groups have fewer inputs; a new one is built beside them."""
+    reel = reels.create_reel_object(bpy.context, "reel", random_model(5), Timeline(10, start=4))
+    group = reels.modifier_of(reel).node_group
+    for item in list(group.interface.items_tree):
+        if item.item_type == "SOCKET" and item.name in ("Retime", "Reel Frame"):
+            group.interface.remove(item)
+    group["holoreel"] = "Holoreel Reel 1"
+    assert reels.timeline_of(reel) == Timeline(10, start=4, last=9)
+    reels.set_timeline(reel, Timeline(20, start=2, retime=True))
+    assert reels.timeline_of(reel) == Timeline(20, start=2, last=19)
+    newer = reels.create_reel_object(bpy.context, "reel", random_model(5), Timeline(10))
+    assert reels.modifier_of(newer).node_group != group
