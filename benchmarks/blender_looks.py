@@ -19,9 +19,8 @@ from holoreel.core.camera import Camera
 from numpy.typing import NDArray
 
 SIZE = 320, 240
-TIMES = (0.5,)
+TIMES = 0.1, 0.5, 0.9
 FISHEYE_DEGREES = 140.0  # the rasterizer's virtual pinhole covers 150 degrees
-FISHEYE_SAMPLES = 4  # of Cycles per pixel: hulls have no low-pass
 CHANGES = 15
 
 
@@ -64,7 +63,6 @@ def fisheye_job(job: dict[str, Any], emit: Callable[[dict[str, Any]], None]) -> 
     data.type, data.panorama_type, data.shift_x, data.shift_y = "PANO", "FISHEYE_EQUIDISTANT", 0.0, 0.0
     data.fisheye_fov = math.radians(job["degrees"])
     data.clip_start = 0.01
-    scene.cycles.samples, scene.cycles.filter_width = job["samples"], 1.0
     for index, (moment, out) in enumerate(job["shots"]):
         render._stop_at(played, moment)
         render._render(scene, Path(out))
@@ -152,7 +150,7 @@ def measure_fisheye(reel: Path, view: Camera, blender: Blender, size: int) -> li
         shots = [(moment, str(Path(folder, f"{index}.exr"))) for index, moment in enumerate(TIMES)]
         job = {"reel": str(reel), "camera": plain.to_json(), "degrees": FISHEYE_DEGREES, "shots": shots}
         here = "holoreel.benchmarks.blender_looks:fisheye_job"
-        run_in_blender(blender, here, {**job, "samples": FISHEYE_SAMPLES}, log=Path(folder, "log"))
+        run_in_blender(blender, here, job, log=Path(folder, "log"))
         for moment, out in shots:
             truth = player.draw(camera, player.frame_at(moment), (0.0, 0.0, 0.0)).image
             row = {"reel": reel.name, "look": "Hull", "engine": "CYCLES", "camera": "fisheye", "time": moment}
@@ -184,7 +182,7 @@ def main() -> None:
     parser.add_argument("--up", type=float, nargs=3, default=(0.0, -1.0, 0.0))
     parser.add_argument("--blender", help="the blender to use")
     parser.add_argument("--engines", nargs="*", default=["CYCLES", "EEVEE"])
-    parser.add_argument("--fisheye", type=int, default=96, help="pixels across of the fisheye's pictures; 0: none")
+    parser.add_argument("--fisheye", type=int, default=192, help="pixels across of the fisheye's pictures; 0: none")
     parser.add_argument("--json", type=Path, help="write the figures there")
     chosen = parser.parse_args()
     blender = find_blender(chosen.blender)
