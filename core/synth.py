@@ -50,11 +50,12 @@ def synthesize(
     *,
     overwrite: bool = False,
     on_progress: Callable[[int, int], None] | None = None,
+    on_picture: Callable[[Path], None] | None = None,
 ) -> SynthResult:
     """Render the capture that `job` describes into the folder `out`, or go on where an earlier call stopped.
 
     `blender` is called for the Blender to use where there is something to render; `on_progress(done, total)` counts
-    views.
+    views, and `on_picture` hears of the picture of each before it is counted.
     Raises `HoloreelError` where the job, the folder or Blender cannot do it; what was rendered stays.
     """
     job.check()
@@ -66,7 +67,7 @@ def synthesize(
         if on_progress:
             on_progress(len(done), len(done) + len(todo))
         if todo or not books.cameras:
-            _render(books, todo, blender(), lock, len(done), on_progress)
+            _render(books, todo, blender(), lock, len(done), on_progress, on_picture)
         for frame in range(job.frame_count):
             books.merge_seeds(frame)
         transforms = write_capture(out, books.capture())
@@ -81,6 +82,7 @@ def _render(
     lock: int,
     done: int,
     on_progress: Callable[[int, int], None] | None,
+    on_picture: Callable[[Path], None] | None,
 ) -> None:
     job, work, total = books.job, books.out / ".work", done + len(todo)
     work.mkdir(parents=True, exist_ok=True)
@@ -95,6 +97,8 @@ def _render(
             layers = Path(event["layers"]) if event["layers"] else None
             books.take((event["camera"], event["frame"]), Path(event["picture"]), layers)
             done += 1
+            if on_picture:
+                on_picture(books.image((event["camera"], event["frame"])))
             if on_progress:
                 on_progress(done, total)
 

@@ -3,6 +3,8 @@
 
 import re
 import time
+from collections import deque
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -11,7 +13,9 @@ from tqdm import tqdm
 
 from ..blender import find_blender
 from ..errors import HoloreelError
+from ..images import Image, read_image
 from ..rig import request as rig_request
+from ..runs import PREVIEW_PIXELS
 from ..status import StatusWriter
 from ..synth import SynthJob, synthesize
 
@@ -70,7 +74,8 @@ def run(
         seed: Seed of all that is random.
         blender: The blender executable, or a Python that has bpy.
         overwrite: Replace the capture of another job in this folder.
-        status: JSON file that says how far the job is, for programs that look in. Then there is no progress line.
+        status: JSON file that says how far the job is, for programs that look in; a small picture of the latest view
+            lies beside it. Then there is no progress line.
     """
     width, height = parse_size(size)
     request = rig_request(
@@ -80,6 +85,7 @@ def run(
     job = SynthJob(scene, request, parse_frames(frames), rig, samples, holdout, film, depth, seed_points, denoise, seed)
     begin, told = time.monotonic(), StatusWriter(status)
     with tqdm(unit="view", dynamic_ncols=True, smoothing=0.1, disable=status is not None) as bar:
+        pictures: deque[Path] = deque(maxlen=1)
         before: list[int] = []  # the views of an earlier call, which say nothing about the speed of this one
 
         def show(done: int, total: int) -> None:
@@ -89,15 +95,25 @@ def run(
             bar.update(done - bar.n)
             made = done - before[0]
             left = (time.monotonic() - begin) / made * (total - done) if made else None
-            told.tell("render", done, total, left, {"views": f"{done} of {total}"})
+            preview = partial(small_picture, pictures[-1]) if pictures else None
+            told.tell("render", done, total, left, {"views": f"{done} of {total}"}, preview)
 
-        result = synthesize(job, out, lambda: find_blender(blender), overwrite=overwrite, on_progress=show)
+        result = synthesize(
+            job, out, lambda: find_blender(blender), overwrite=overwrite, on_progress=show, on_picture=pictures.append
+        )
     for warning in result.warnings:
         print(f"warning: {warning}: is the camera inside something, or does it see nothing?")
     seconds = time.monotonic() - begin
     print(
         f"{result.transforms}: {cameras} cameras x {job.frame_count} frames, {result.rendered} views in {seconds:.1f} s"
     )
+
+
+def small_picture(path: Path) -> Image:
+    """Read every so many pixels of a picture: as few as a preview has."""
+    picture = read_image(path)
+    step = -(-max(picture.shape[:2]) // PREVIEW_PIXELS)
+    return picture[step // 2 :: step, step // 2 :: step]
 
 
 def parse_size(text: str) -> tuple[int, int]:

@@ -443,6 +443,9 @@ def test_a_capture_is_filmed_from_the_open_file_as_it_is(core: Path, tmp_path: P
     assert bpy.data.filepath == ""
     assert settle(job) == State.DONE, (job.message, job.log.read_text())
     assert job.status.figures == {"views": "2 of 2"}
+    assert job.status.previews > 0
+    previews.icon(job.name, job.status.previews, preview_path(job.status_file))
+    assert tuple(previews._pictures[job.name].image_size) == (32, 24)
     assert (tmp_path / "film" / "transforms.json").is_file()
     seeds = (tmp_path / "film" / "seeds").glob("*.ply")
     from holoreel.core.capture import read_points

@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 from holoreel.core.capture import Points, read_capture, write_capture, write_points
 from holoreel.core.cli import main
+from holoreel.core.cli.synth import small_picture
 from holoreel.core.errors import HoloreelError
-from holoreel.core.images import read_image
+from holoreel.core.images import read_image, write_png
 from holoreel.core.reel import load_gaussians
 from holoreel.core.status import EVERY_SECONDS, PREVIEW_SECONDS, Status, StatusWriter, preview_path, read_status
 
@@ -102,3 +103,14 @@ def test_training_says_how_far_it_is_and_learns_the_same(recording: Any, tmp_pat
     assert read_image(preview_path(status)).shape == (24, 32, 3)
     plain, same = (load_gaussians(tmp_path / f"{name}.reel").gaussians for name in ("plain", "told"))
     np.testing.assert_array_equal(plain.means, same.means)
+
+
+@pytest.mark.parametrize(("size", "small"), [((24, 32), (24, 32)), ((144, 256), (144, 256)), ((300, 514), (100, 171))])
+def test_previews_of_views_are_small(tmp_path: Path, size: tuple[int, int], small: tuple[int, int]) -> None:
+    picture = np.zeros((*size, 3), np.uint8)
+    picture[: size[0] // 2] = 255
+    write_png(tmp_path / "view.png", picture / 255)
+    shown = small_picture(tmp_path / "view.png")
+    assert shown.shape == (*small, 3)
+    assert shown[0, 0, 0] == 1
+    assert shown[-1, -1, 0] == 0
