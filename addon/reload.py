@@ -69,7 +69,7 @@ def _load(context: bpy.types.Context, played: bpy.types.Object, path: Path) -> l
         set_rung(played, read_video_reel(path), played[INFO].get("rung"))
         remember_source(played, path)
         return []
-    files = list(filter(None, str(played[INFO].get("files", "")).split("\n")))
+    files = list(filter(None, str(played.get(INFO, {}).get("files", "")).split("\n")))
     parts = read_sequence([path.with_name(name) for name in files]) if files else load_segments(path)
     detail = _detail(played)
     beside = played.data.library is not None
@@ -89,7 +89,7 @@ def _detail(played: bpy.types.Object) -> float:
 
 def _follow_length(played: bpy.types.Object, count: int) -> None:
     """Play a reel that has become longer or shorter to its end, if it was played to its end before."""
-    before = played[INFO].get("frame_count")
+    before = played.get(INFO, {}).get("frame_count")
     if count == before:
         return
     modifier = modifier_of(played)

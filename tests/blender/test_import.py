@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from holoreel.addon import attributes, clouds, compat, reels, reload
 from holoreel.addon.nodes.reel import DISPLAY, POINTS
-from holoreel.addon.timeline import LOOP
+from holoreel.addon.timeline import LOOP, Timeline
 from holoreel.core.errors import HoloreelError
 from holoreel.core.gaussians.importance import importance, most_important_first
 from holoreel.core.gaussians.model import EvaluatedGaussians, SpacetimeGaussians
@@ -114,6 +114,24 @@ def test_most_important_come_first(random_model: Model) -> None:
     two = np.sort(model.log_scales[:3], axis=1)[:, 1:].sum(axis=1)
     expected = alive.reshape(3, -1).mean(axis=1) * np.exp(0.5 * two)
     np.testing.assert_allclose(importance(model)[:3], expected, rtol=1e-2)
+
+
+def test_renders_have_a_detail_of_their_own(random_model: Model, render: Callable[[], NDArray]) -> None:
+    scene = bpy.context.scene
+    model = random_model(300)
+    model.means[:, 2] *= -1  # before Blender's camera
+    reel = reels.create_reel_object(bpy.context, "reel", model, Timeline(10))
+    modifier = show_points(reel)
+    camera = bpy.data.objects.new("Camera", bpy.data.cameras.new("Camera"))
+    scene.collection.objects.link(camera)
+    scene.camera = camera
+    scene.render.engine, scene.cycles.samples, scene.cycles.use_denoising = "CYCLES", 1, False
+    scene.render.resolution_x, scene.render.resolution_y, scene.render.film_transparent = 24, 24, True
+    for viewport, rendered, seen in ((0.0, 100.0, True), (100.0, 0.0, False)):
+        compat.set_input(modifier, "Viewport Detail", viewport)
+        compat.set_input(modifier, "Render Detail", rendered)
+        assert render()[:, :, 3].any() == seen
+        assert bool(len(evaluated(reel)["position"])) != seen
 
 
 def test_scale_and_up_turn_the_whole_reel(random_model: Model, tmp_path: Path) -> None:
@@ -249,6 +267,17 @@ def test_files_of_another_kind_are_not_read_into_a_reel(random_model: Model, tmp
         reload.relink_reel(bpy.context, created, tmp_path / "b.reel")
     with pytest.raises(HoloreelError, match="no reel"):
         reload.store_beside(bpy.data.objects.new("Empty", None))
+
+
+def test_a_reel_made_by_a_script_can_be_given_a_file(random_model: Model, tmp_path: Path) -> None:
+    save_gaussians(tmp_path / "a.reel", random_model(50), fps=24, frame_start=1, frame_count=5)
+    reel = reels.create_reel_object(bpy.context, "reel", random_model(7), Timeline(10))
+    with pytest.raises(HoloreelError, match="was not imported"):
+        reload.reload_reel(bpy.context, reel)
+    reload.relink_reel(bpy.context, reel, tmp_path / "a.reel")
+    assert len(reel.data.points) == 50
+    assert reels.timeline_of(reel).frame_count == 5
+    assert reels.source_of(reel) == tmp_path / "a.reel"
 
 
 @pytest.mark.usefixtures("registered")
