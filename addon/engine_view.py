@@ -76,7 +76,8 @@ class Progressive:
         except CancelledError:
             return None
         except HoloreelError:
-            self.finest = len(SHARES)  # not again until something changes
+            if self._drawn is self.shot:
+                self.finest = len(SHARES)  # not again until something changes
             raise
         finally:
             drawing.close()
@@ -102,6 +103,7 @@ class View:
         """Show what there is, and see to more."""
         view, region = context.region_data, context.region
         looking = (*map(tuple, (*view.view_matrix, *view.window_matrix)), region.width, region.height)
+        looking += _settings_of(depsgraph.scene)  # not every change of these is announced
         if self._changed or looking != self._looking:
             self._looking, self._changed = looking, False
             quality = depsgraph.scene.holoreel_engine.viewport_quality.lower()
@@ -114,11 +116,14 @@ class View:
             return
         try:
             picture = self._progress.step(worker.worker(), self._shot)
-        finally:
+        except HoloreelError:
             self._paint(region.width, region.height)
+            if self._progress.finest < len(SHARES):  # it was about another view
+                engine.tag_redraw()
+            raise
         if picture is not None:
             self._texture = _texture(picture)
-            self._paint(region.width, region.height)
+        self._paint(region.width, region.height)
         done = self._progress.finest == len(SHARES) and not self._progress.is_waiting
         engine.update_stats("Holoreel", "" if done else "Drawing")
         if not self._progress.is_waiting:
@@ -158,6 +163,12 @@ class View:
         gpu.state.blend_set("ALPHA_PREMULT")
         draw_texture_2d(self._texture, (0, 0), width, height)
         gpu.state.blend_set("NONE")
+
+
+def _settings_of(scene: bpy.types.Scene) -> tuple[object, ...]:
+    settings = scene.holoreel_engine
+    chosen = settings.color, settings.background, *settings.background_color, settings.viewport_quality
+    return *chosen, scene.render.film_transparent, scene.frame_current_final
 
 
 def _smaller(shot: Shot, share: int) -> Shot:

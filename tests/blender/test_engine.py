@@ -297,6 +297,7 @@ def test_what_happens_to_the_worker_is_a_sentence_on_that_frame(
     client.close()
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("core")
 def test_a_worker_killed_between_frames_is_started_again(files: dict[str, Path], tmp_path: Path) -> None:
     look(bpy.context.scene)
@@ -427,10 +428,15 @@ def test_composites_refuse_in_a_sentence(files: dict[str, Path]) -> None:
 
 
 @pytest.mark.usefixtures("core")
-def test_viewports_get_a_small_picture_first_and_begin_again_on_change(files: dict[str, Path]) -> None:
+def test_viewports_get_a_small_picture_first_and_begin_again_on_change(files: dict[str, Path], tmp_path: Path) -> None:
+    """In the end they show what F12 renders."""
     scene = bpy.context.scene
     look(scene)
     play(files["lite"])
+    bpy.ops.holoreel.setup_engine()
+    scene.holoreel_engine.color = "DISPLAY"
+    scene.view_settings.view_transform = "Raw"
+    rendered = png(tmp_path)
     depsgraph = bpy.context.evaluated_depsgraph_get()
     camera = camera_from_object(scene.camera, scene, depsgraph)
     progress, client = engine_view.Progressive(), worker.worker()
@@ -448,6 +454,7 @@ def test_viewports_get_a_small_picture_first_and_begin_again_on_change(files: di
     small, full = pictures(one)
     assert small.shape == (HEIGHT // 4, WIDTH // 4, 4)
     assert full.shape == (HEIGHT, WIDTH, 4)
+    assert np.abs(full[::-1, :, :3] * 255 - rendered).max() <= 1
     blocks = full.reshape(HEIGHT // 4, 4, WIDTH // 4, 4, 4).mean((1, 3))
     assert np.abs(blocks - small).mean() < 0.05
     assert progress.step(client, one) is None
