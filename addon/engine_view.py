@@ -105,10 +105,11 @@ class View:
         looking = (*map(tuple, (*view.view_matrix, *view.window_matrix)), region.width, region.height)
         looking += _settings_of(depsgraph.scene)  # not every change of these is announced
         if self._changed or looking != self._looking:
-            self._looking, self._changed = looking, False
+            self._looking = ()  # if this fails, it fails again the next time
             quality = depsgraph.scene.holoreel_engine.viewport_quality.lower()
             camera = _camera_of(view, region)
             self._shot = shot_of(depsgraph, camera, quality=quality)
+            self._looking, self._changed = looking, False
         if self._shot is None:
             self._progress.close()
             self._texture = None
