@@ -33,9 +33,7 @@ class HOLOREEL_PT_look(SubPanel, bpy.types.Panel):
         for sentence in look_problems(context.scene, look, compat.get_input(modifier, "Color")):
             draw_text(self.layout, sentence, letters_in(context.region), "ERROR")
         if _shows_preview(context):
-            draw_text(
-                self.layout, "Solid shading is a preview: points without colors", letters_in(context.region), "INFO"
-            )
+            draw_text(self.layout, "A preview: Solid shows gray points", letters_in(context.region), "INFO")
         if look == POINTS:
             return
         if ends_rays_early(context.scene):
@@ -79,13 +77,13 @@ def look_problems(scene: bpy.types.Scene, look: str, color: str) -> list[str]:
     if look == SPLATS and camera is None:
         found.append("Splats face the active camera: add one")
     if look == SPLATS and camera is not None and camera.type == "CAMERA" and camera.data.type in ("PANO", "CUSTOM"):
-        found.append("Splats are for perspective cameras: take Hull in Cycles, or Points")
+        found.append("Splats need a perspective camera: take Hull")
     if engine == "BLENDER_WORKBENCH":
-        found.append("Workbench shows a preview: points without colors")
+        found.append("A preview: Workbench shows gray points")
     if look == HULL and engine == compat.eevee_engine():
         found.append("Hulls are for Cycles; EEVEE shows a preview")
     if look != POINTS and ends_rays_early(scene):
-        found.append("Cycles lets rays through few splats: dark or noisy")
+        found.append("Cycles ends rays early: dark or noisy")
     return found
 
 

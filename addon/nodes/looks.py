@@ -89,7 +89,7 @@ def points(tree: Tree) -> None:
 
 
 @node_group(
-    "Holoreel Splats", 4, "Show evaluated Gaussians as the splats they were trained as, seen by the active camera"
+    "Holoreel Splats", 5, "Show evaluated Gaussians as the splats they were trained as, seen by the active camera"
 )
 def splats(tree: Tree) -> None:
     """One quad per Gaussian, parallel to the image plane (EWA splatting), far ones first.
@@ -112,8 +112,11 @@ def splats(tree: Tree) -> None:
     perspective = 1.0 - view.orthographic
     distance = depth * perspective + view.orthographic
     slopes = [
-        _clamped(offset.dot(axis) / depth, tangent * JACOBIAN_CLAMP) * perspective
-        for axis, tangent in ((view.across, view.tangent_x), (view.above, view.tangent_y))
+        _clamped(offset.dot(axis) / depth, middle, tangent * JACOBIAN_CLAMP) * perspective
+        for axis, middle, tangent in (
+            (view.across, view.middle_x, view.tangent_x),
+            (view.above, view.middle_y, view.tangent_y),
+        )
     ]
     unrotate = tree.attribute("rotation", "QUATERNION").inverted()
     scale = tree.attribute("scale", "FLOAT_VECTOR")
@@ -138,8 +141,8 @@ def _square(value: Float) -> Float:
     return value * value
 
 
-def _clamped(value: Float, limit: Float) -> Float:
-    return value.at_most(limit).at_least(-limit)
+def _clamped(value: Float, middle: Float, reach: Float) -> Float:
+    return value.at_most(middle + reach).at_least(middle - reach)
 
 
 def _quads(tree: Tree, cloud: Geometry) -> Geometry:

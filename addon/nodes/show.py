@@ -80,7 +80,7 @@ def set_show_defaults(tree: Tree, look: str = SPLATS) -> None:
         tree.set_menu_default(name, item)
 
 
-@node_group("Holoreel Show", 3, "Crop evaluated points, choose their colors, and show them in one of the looks")
+@node_group("Holoreel Show", 4, "Crop evaluated points, choose their colors, and show them in one of the looks")
 def show_group(tree: Tree) -> None:
     """The inputs are those of `show_inputs`."""
     cloud = tree.geometry_input()

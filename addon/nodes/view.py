@@ -64,9 +64,12 @@ class View:
 
         info = tree.node("GeometryNodeCameraInfo", {"Camera": camera})
         entries = tree.node("FunctionNodeSeparateMatrix", {0: _matrix(tree, info.outputs["Projection Matrix"])}).outputs
-        # Half the tangent of the field of view, and the size of a pixel at depth 1 (anywhere, if orthographic).
+        # Half the extent of what is seen at depth 1 (anywhere, if orthographic), and the middle of it where the lens is
+        # shifted; the size of a pixel there.
         self.tangent_x = 1.0 / Float(tree, entries["Column 1 Row 1"])
         self.tangent_y = 1.0 / Float(tree, entries["Column 2 Row 2"])
+        self.middle_x = self.tangent_x * Float(tree, entries["Column 3 Row 1"])
+        self.middle_y = self.tangent_y * Float(tree, entries["Column 3 Row 2"])
         self.pixel_x = self.tangent_x * 2.0 / width_px * pixel_scale
         self.pixel_y = self.tangent_y * 2.0 / height_px * pixel_scale
         self.orthographic = Float(tree, info.outputs["Is Orthographic"])

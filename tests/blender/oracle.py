@@ -55,12 +55,14 @@ def splat(
     columns, rows = np.meshgrid(np.arange(view.width) + 0.5, np.arange(view.height) + 0.5)
     color, through = np.zeros((view.height, view.width, 3)), np.ones((view.height, view.width))
     stopped = np.zeros_like(through, dtype=bool)
-    limit_x, limit_y = CLAMP * 0.5 * view.width / view.fx, CLAMP * 0.5 * view.height / view.fy
+    margin = 0.5 * (CLAMP - 1.0)  # around the picture, wherever the principal point lies
+    limits_x = [(edge * view.width - view.cx) / view.fx for edge in (-margin, 1.0 + margin)]
+    limits_y = [(edge * view.height - view.cy) / view.fy for edge in (-margin, 1.0 + margin)]
     for index in np.argsort(places[:, 2], kind="stable"):
         x, y, z = places[index]
         if z < near:
             continue
-        slope_x, slope_y = np.clip(x / z, -limit_x, limit_x), np.clip(y / z, -limit_y, limit_y)
+        slope_x, slope_y = np.clip(x / z, *limits_x), np.clip(y / z, *limits_y)
         jacobian = np.array([[view.fx / z, 0, -view.fx * slope_x / z], [0, view.fy / z, -view.fy * slope_y / z]])
         spread = jacobian @ rotation @ spreads[index]
         conic = np.linalg.inv(spread @ spread.T + LOW_PASS * np.eye(2))
