@@ -52,8 +52,9 @@ class HOLOREEL_PT_engine(_EnginePanel, bpy.types.Panel):
         column.prop(settings, "background")
         if settings.background == COLOR:
             column.prop(settings, "background_color", text="")
+        layout.label(text="VideoRF")
         column = layout.column(align=True)
-        column.prop(settings, "quality", text="VideoRF Quality")
+        column.prop(settings, "quality")
         column.prop(settings, "viewport_quality", text="Viewport")
 
 
