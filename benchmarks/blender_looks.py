@@ -18,7 +18,7 @@ from holoreel.core.blender import Blender, find_blender, run_in_blender
 from holoreel.core.camera import Camera
 from numpy.typing import NDArray
 
-SIZE = 320, 240
+SIZE = 160, 120
 TIMES = 0.1, 0.5, 0.9
 FISHEYE_DEGREES = 140.0  # the rasterizer's virtual pinhole covers 150 degrees
 CHANGES = 15
