@@ -25,7 +25,7 @@ ROOT = Path(__file__).resolve().parents[1]
 OUT = ROOT / "docs" / "images"
 SCREEN = (1400, 900)
 LOOKS = ("Splats", "Hull", "Points")
-PATIENCE_SECONDS = 900
+PATIENCE_SECONDS = 3600
 GAP, CAPTION = 12, 30
 CROPS = {
     "preferences": (176, 276, 1144, 494),
@@ -40,8 +40,9 @@ def main() -> None:
     parser.add_argument("--demo", type=Path, default=ROOT / "demo", help="a finished demo")
     parser.add_argument("--field", type=Path, help="a VideoRF reel to show; none without it")
     parser.add_argument("--blender", type=Path, help="a real Blender for the windows; renders alone without it")
+    parser.add_argument("--only", choices=("looks", "windows"), help="make these alone")
     parser.add_argument("--out", type=Path, default=OUT)
-    parser.add_argument("--width", type=int, default=400, help="of the renders, in pixels")
+    parser.add_argument("--width", type=int, default=320, help="of the renders, in pixels")
     chosen = parser.parse_args()
     reel = next(chosen.demo.glob("*.reel"), None)
     if reel is None:
@@ -51,8 +52,9 @@ def main() -> None:
     chosen.out.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory() as folder:
         work = Path(folder)
-        looks(reel, chosen.demo, chosen.width, work, chosen.out / "blender-looks.jpg")
-        if chosen.blender:
+        if chosen.only != "windows":
+            looks(reel, chosen.demo, chosen.width, work, chosen.out / "blender-looks.jpg")
+        if chosen.blender and chosen.only != "looks":
             windows(chosen, stage(reel, chosen.demo, work), work)
 
 
@@ -162,7 +164,7 @@ def photograph(blender: Path, job: dict[str, str], work: Path, environment: dict
             time.sleep(0.1)
         log.seek(0)
         said = log.read()
-    if "Traceback" in said:
+    if child.returncode or "Traceback" in said:
         sys.exit(said)
     return taken
 

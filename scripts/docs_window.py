@@ -107,7 +107,7 @@ def tour(window: Window) -> Iterator[None]:
 def panels(window: Window) -> Iterator[None]:
     """The panels that need no reel, one by one; titles are 28 pixels apart."""
     bpy.ops.wm.read_homefile(use_empty=True)
-    yield from wait(3)
+    yield from wait(LONG)
     yield from window.open_tab()
     for name, below in (("train", 163), ("synthesize", 69)):  # from below: what is above is closed by then
         window.open_panel(below)
@@ -120,6 +120,7 @@ def panels(window: Window) -> Iterator[None]:
 def gaussians(window: Window) -> Iterator[None]:
     """A reel in each shading, seen by its camera and from elsewhere."""
     bpy.ops.wm.open_mainfile(filepath=window.job["scene"], load_ui=False)
+    yield from wait(LONG)  # Blender crashes where a new file's window is changed before it was drawn
     bpy.context.scene.frame_set(4)
     played = next(thing for thing in bpy.context.scene.objects if thing.type == "POINTCLOUD")
     bpy.context.view_layer.objects.active = played
@@ -143,7 +144,7 @@ def gaussians(window: Window) -> Iterator[None]:
 def field(window: Window) -> Iterator[None]:
     """A VideoRF."""
     bpy.ops.wm.read_homefile(use_empty=True)
-    yield from wait(3)
+    yield from wait(LONG)
     with window.context():
         bpy.ops.holoreel.import_reel(filepath=window.job["field"], set_scene_timing=True)
         bpy.ops.view3d.view_selected()
