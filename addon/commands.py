@@ -25,7 +25,7 @@ from ..core.reel import VIDEORF, load_gaussians, reel_kind
 from ..core.videorf.package import read_video_reel
 from . import reels, render
 from .compat import set_input
-from .environment import child_environment
+from .environment import child_environment, version_check
 from .nodes.reel import COLORS, LOOKS
 from .preferences import core_python
 
@@ -226,7 +226,14 @@ def _pass_on(arguments: list[str]) -> int:
     python = core_python()
     environment = child_environment() | {ENVIRONMENT_VARIABLE: str(_this_blender().path)}
     try:
-        done = subprocess.run([str(python), "-I", "-m", "holoreel.core", *arguments], env=environment, check=False)
+        checked = subprocess.run(
+            version_check(python).argv, env=environment, capture_output=True, text=True, check=False
+        )
+        if checked.returncode:
+            said = checked.stderr.strip().splitlines() or [f"it ends with status {checked.returncode}"]
+            raise HoloreelError(f"{python} cannot be used ({said[-1].rstrip('.')}): choose another core environment.")
+        command = [str(python), "-I", "-m", "holoreel.core", *arguments]
+        done = subprocess.run(command, env=environment, check=False)
     except OSError as error:
         raise HoloreelError(f"{python} cannot be run ({error.strerror}): choose another core environment.") from error
     return done.returncode if done.returncode >= 0 else 128 - done.returncode

@@ -30,7 +30,9 @@ def listener(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
         pytest.skip("the stand-in is a shell script")
     heard = tmp_path / "heard.json"
     python = tmp_path / "python"
-    python.write_text(f'#!/bin/sh\nprintf "%s\\n" "$HOLOREEL_BLENDER" "$@" >"{heard}"\nexit 3\n')
+    python.write_text(
+        f'#!/bin/sh\n[ "$2" = -c ] && exit 0\nprintf "%s\\n" "$HOLOREEL_BLENDER" "$@" >"{heard}"\nexit 3\n'
+    )
     python.chmod(0o755)
     monkeypatch.setenv("HOLOREEL_PYTHON", str(python))
     return heard
@@ -102,6 +104,22 @@ def test_without_a_core_environment_it_says_what_to_do(
     monkeypatch.setenv("HOLOREEL_PYTHON", str(tmp_path / "none"))
     assert commands.run(["train", "stg"]) == 2
     assert "HOLOREEL_PYTHON" in capfd.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("script", "said"), [("echo 'it has another version.' >&2; exit 1", "another"), ("exit 7", "7")]
+)
+def test_an_environment_of_another_version_is_refused(
+    script: str, said: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    python = tmp_path / "python"
+    python.write_text(f"#!/bin/sh\n{script}\n")
+    python.chmod(0o755)
+    monkeypatch.setenv("HOLOREEL_PYTHON", str(python))
+    assert commands.run(["info", "x"]) == 2
+    sentence = capfd.readouterr().err.strip()
+    assert said in sentence
+    assert "\n" not in sentence
 
 
 def test_help_names_what_there_is(capfd: pytest.CaptureFixture[str]) -> None:

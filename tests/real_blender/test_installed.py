@@ -106,7 +106,7 @@ def test_command_render(blender: Run, reel: Path, tmp_path: Path) -> None:
 
 def test_command_passes_on_what_blender_cannot_do(blender: Run, tmp_path: Path) -> None:
     python, heard = tmp_path / "python", tmp_path / "heard"
-    python.write_text(f'#!/bin/sh\nprintf "%s\\n" "$@" >"{heard}"\nexit 3\n')
+    python.write_text(f'#!/bin/sh\n[ "$2" = -c ] && exit 0\nprintf "%s\\n" "$@" >"{heard}"\nexit 3\n')
     python.chmod(0o755)
     words = ["train", "stg", "capture", "--out", "x"]
     blender("--background", "--command", "holoreel", *words, status=3, HOLOREEL_PYTHON=str(python))
