@@ -28,7 +28,7 @@ LOOKS = ("Splats", "Hull", "Points")
 PATIENCE_SECONDS = 3600
 GAP, CAPTION = 12, 30
 CROPS = {
-    "preferences": (176, 276, 1144, 494),
+    "preferences": (176, 276, 1144, 520),
     "train": (0, 0, 292, 420),
     "synthesize": (0, 0, 292, 420),
 }  # parts of pictures
