@@ -68,20 +68,36 @@ def layers_of(depsgraph: bpy.types.Depsgraph, camera: Camera) -> Iterator[Layer]
 
 
 def shown_reels(depsgraph: bpy.types.Depsgraph) -> Iterator[tuple[bpy.types.Object, Array]]:
-    """Yield the evaluated object and the world matrix of every reel that the dependency graph shows, once each.
+    """Yield the evaluated object and the world matrix of every reel that the dependency graph shows.
 
-    What a reel's nodes make of it (points, quads) is listed by Blender as more of the same object.
+    Instances are those of collections, nested ones included. `Depsgraph.object_instances` would not do: it lists every
+    instance that the nodes of a reel's look make as a reel of its own.
     """
-    seen: set[tuple[str, bytes]] = set()
-    for instance in depsgraph.object_instances:
-        played = instance.object
-        if not instance.show_self or reels.modifier_of(played) is None:
-            continue
-        matrix = np.array(instance.matrix_world, np.float64)
-        key = (played.original.name_full, np.round(matrix, 5).tobytes())
-        if key not in seen:
-            seen.add(key)
-            yield played, matrix
+    for shown in depsgraph.objects:
+        yield from _reels_of(shown.original, np.eye(4), depsgraph)
+
+
+def _reels_of(
+    shown: bpy.types.Object, place: Array, depsgraph: bpy.types.Depsgraph
+) -> Iterator[tuple[bpy.types.Object, Array]]:
+    evaluated = shown.evaluated_get(depsgraph)
+    matrix = place @ np.array(evaluated.matrix_world, np.float64)
+    if reels.modifier_of(shown) is not None:
+        yield evaluated, matrix
+    if shown.instance_type == "COLLECTION" and shown.instance_collection is not None:
+        moved = np.eye(4)
+        moved[:3, 3] = -np.array(shown.instance_collection.instance_offset)
+        for member in _members(shown.instance_collection, depsgraph.mode):
+            yield from _reels_of(member, matrix @ moved, depsgraph)
+
+
+def _members(collection: bpy.types.Collection, mode: str) -> Iterator[bpy.types.Object]:
+    """Yield the objects of a collection and of those in it that are not hidden from the viewport or from renders."""
+    hidden = "hide_render" if mode == "RENDER" else "hide_viewport"
+    yield from (member for member in collection.objects if not getattr(member, hidden))
+    for child in collection.children:
+        if not getattr(child, hidden):
+            yield from _members(child, mode)
 
 
 def in_reel_space(camera: Camera, matrix_world: Array, name: str) -> tuple[float, Camera]:

@@ -18,7 +18,8 @@ import numpy as np
 import pytest
 from holoreel.addon import composite, engine, engine_view, environment, reels, shots, worker
 from holoreel.addon.cameras import camera_from_object
-from holoreel.addon.compat import enable_nodes
+from holoreel.addon.compat import enable_nodes, set_input
+from holoreel.addon.nodes.show import HULL, POINTS
 from holoreel.addon.timeline import PING_PONG, Timeline
 from holoreel.core.camera_blender import camera_from_projection
 from holoreel.core.errors import HoloreelError
@@ -218,6 +219,7 @@ def test_what_is_not_rendered_is_not_drawn_and_instances_are(files: dict[str, Pa
     assert [layer.path.stem for layer in layers()] == ["lite", "full"]
     nested = bpy.data.collections.new("Nested")
     nested.objects.link(full)
+    nested.instance_offset = (0.5, 0, 0)
     scene.collection.objects.unlink(full)
     for place in ((1, 0, 0), (-1, 0, 2)):
         instancer = bpy.data.objects.new("Instancer", None)
@@ -228,9 +230,15 @@ def test_what_is_not_rendered_is_not_drawn_and_instances_are(files: dict[str, Pa
     assert [layer.path.stem for layer in found] == ["lite", "full", "full"]
     plain = camera_from_object(scene.camera, scene).world_to_camera
     moves = [np.linalg.inv(plain) @ layer.camera.world_to_camera for layer in found]
-    np.testing.assert_allclose([move[:3, 3] for move in moves], [(0, 0, 0), (1, 0, 0), (-1, 0, 2)], atol=1e-5)
+    np.testing.assert_allclose([move[:3, 3] for move in moves], [(0, 0, 0), (0.5, 0, 0), (-1.5, 0, 2)], atol=1e-5)
+    for look_of_reel in (HULL, POINTS):  # whose nodes make many instances, or none
+        set_input(reels.modifier_of(lite), "Look", look_of_reel)
+        set_input(reels.modifier_of(full), "Look", look_of_reel)
+        assert [layer.path.stem for layer in layers()] == ["lite", "full", "full"]
     lite.hide_viewport = True
     assert [layer.path.stem for layer in layers()] == ["full", "full"]
+    full.hide_viewport = True
+    assert layers() == []
 
 
 def refusal() -> str:
