@@ -9,6 +9,7 @@ import threading
 import traceback
 import warnings
 from collections.abc import Callable
+from contextlib import suppress
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import IO, Any
@@ -73,6 +74,7 @@ class Server:
                 return
 
     def _listen(self) -> None:
+        announced = None
         while line := self._source.readline():
             try:
                 message = decode(line)
@@ -82,9 +84,11 @@ class Server:
             if message.get("method") == "cancel":
                 self._unwanted.add(_parameters(message).get("id"))
             else:
+                announced = _parameters(message).get("buffer", announced)
                 self._requests.put(message)
-        for buffer in list(self._buffers.values()):
-            buffer.unlink()
+        if isinstance(announced, str):  # it may not have been mapped yet
+            with suppress(OSError):
+                Path(announced).unlink()
         os._exit(0)  # the client is gone, and nobody waits for what is being drawn
 
     def _answer(self, request: Message) -> Message:

@@ -323,7 +323,8 @@ def test_no_room_for_pixels_is_said_before_anything_is_drawn(fake, monkeypatch):
         client.draw(SHOT)
 
 
-def test_the_worker_ends_with_its_client(tmp_path, files):
+@pytest.mark.parametrize("asking", [[], ["again"]], ids=["idle", "asking"])
+def test_the_worker_ends_with_its_client(tmp_path, files, asking):
     """Whatever takes the client away; and nothing of it stays in shared memory."""
     code = f"""
         import os, signal, sys
@@ -334,10 +335,14 @@ def test_the_worker_ends_with_its_client(tmp_path, files):
         client = Client(Path(sys.executable), log=Path({str(tmp_path / "log")!r}))
         camera = Camera(52, 41, 44.0, 43.0, 25.0, 22.0)
         drawing = client.draw(Shot((Layer(Path({str(files["lite"])!r}), 0.0, 5, camera),)))
+        if sys.argv[1:]:  # another one, in a buffer that the worker has not seen yet
+            client.begin(Shot((Layer(Path({str(files["lite"])!r}), 1.0, 5, camera),)))
         print(os.getpid(), client.pid, flush=True)
         os.kill(os.getpid(), signal.SIGKILL)
     """
-    done = subprocess.run([sys.executable, "-c", textwrap.dedent(code)], capture_output=True, text=True, check=False)
+    done = subprocess.run(
+        [sys.executable, "-c", textwrap.dedent(code), *asking], capture_output=True, text=True, check=False
+    )
     ours, worker = map(int, done.stdout.split())
     for _ in range(200):
         try:
