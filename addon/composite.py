@@ -11,7 +11,7 @@ import bpy
 
 from ..core.errors import HoloreelError
 from . import compat
-from .engine import ENGINE
+from .engine_settings import ENGINE
 from .reels import modifier_of
 from .shots import LINEAR
 

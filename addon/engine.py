@@ -17,10 +17,9 @@ from ..core.worker.frames import FAR
 from ..core.worker.protocol import CancelledError, Shot
 from . import engine_settings, worker
 from .cameras import camera_from_object
+from .engine_settings import ENGINE
 from .engine_view import View
 from .shots import COLOR, LINEAR, shot_of
-
-ENGINE = "HOLOREEL"
 
 # Panels of Blender's own that make sense with this engine: their module, and the beginning of their names.
 _PANELS = (

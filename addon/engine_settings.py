@@ -13,6 +13,9 @@ _QUALITIES = (
 )
 
 
+ENGINE = "HOLOREEL"
+
+
 class HoloreelEngineSettings(bpy.types.PropertyGroup):
     """Settings of one scene."""
 
@@ -51,6 +54,11 @@ class HoloreelEngineSettings(bpy.types.PropertyGroup):
         description="How finely rays are marched through a VideoRF in the viewport",
         items=_QUALITIES,
         default="FAST",
+    )
+    is_chosen: bpy.props.BoolProperty(
+        name="Is Chosen",
+        description="Whether the scene is rendered by the Holoreel engine; reels need not make any geometry then",
+        get=lambda settings: settings.id_data.render.engine == ENGINE,
     )
     use_pass_alpha: bpy.props.BoolProperty(
         name="Alpha",

@@ -25,7 +25,7 @@ TYPES = {
     "rotation": ("QUATERNION", "value"),
     "radiance:base": ("FLOAT4", "vector"),
 }
-NOT_ASKED = {"Workbench": False, "Look": POINTS, "Color": DISPLAY, "Hide Fainter Than": 0.0}
+NOT_ASKED = {"Workbench": False, "Holoreel Engine": False, "Look": POINTS, "Color": DISPLAY, "Hide Fainter Than": 0.0}
 
 
 def native_arrays(gaussians: EvaluatedGaussians) -> dict[str, NDArray[np.float32]]:

@@ -26,13 +26,15 @@ MODIFIER = "Holoreel"
 FIELD_NAME = "Holoreel Field Reel"  # the group of a VideoRF, as `NAME` is that of Spacetime Gaussians
 INFO = "holoreel"  # custom property of a reel's object: source, kind, fps, frame_count, gaussians or points, report
 
-# Inputs of a look that follow the scene: a driver's expression and its variables, which are 0 where there is no camera.
+# Inputs of a look that follow the scene: a driver's expression and its variables, which are 0 where there is no camera,
+# or no Holoreel to ask.
 # Blender numbers its render engines and kinds of cameras: 1 is Workbench, 2 a panoramic camera.
 _SIZE = {"x": "render.resolution_x", "y": "render.resolution_y", "percent": "render.resolution_percentage"}
 _FOLLOWED = {
     "Render Width": ("floor(x * percent / 100)", _SIZE),
     "Render Height": ("floor(y * percent / 100)", _SIZE),
     "Workbench": ("engine == 1", {"engine": "render.engine"}),
+    "Holoreel Engine": ("is_chosen", {"is_chosen": "holoreel_engine.is_chosen"}),
     "Pixel Angle": (
         "field * 100 / (max(x, y) * percent) if kind == 2 else 0",
         {"kind": "camera.data.type", "field": "camera.data.fisheye_fov", **_SIZE},

@@ -3,7 +3,8 @@
 
 import bpy
 
-from ..addon.engine import ENGINE, setup_engine
+from ..addon.engine import setup_engine
+from ..addon.engine_settings import ENGINE
 
 
 class HOLOREEL_OT_setup_engine(bpy.types.Operator):

@@ -3,8 +3,7 @@
 
 import bpy
 
-from ..addon.engine import ENGINE
-from ..addon.engine_settings import COLOR, LINEAR
+from ..addon.engine_settings import COLOR, ENGINE, LINEAR
 from ..core.camera_fisheye import EQUIDISTANT, EQUISOLID, POLYNOMIAL
 from ..operators.setup_composite import HOLOREEL_OT_setup_composite
 from ..operators.setup_engine import HOLOREEL_OT_setup_engine

@@ -453,6 +453,10 @@ class Tree:
 
     # --- Geometry
 
+    def unless(self, condition: Boolean, geometry: Geometry) -> Geometry:
+        """Return nothing where the condition is true, else the geometry; what makes it is not computed then."""
+        return self.geometry("GeometryNodeSwitch", {"Switch": condition, "False": geometry}, input_type="GEOMETRY")
+
     def geometry(self, kind: str, inputs: Mapping[int | str, Any], **properties: Any) -> Geometry:
         """Add a node whose first output is a geometry."""
         return Geometry(self, self.node(kind, inputs, **properties).outputs[0])

@@ -21,7 +21,7 @@ from .library import TAG, ensure_group
 from .show import POINTS, set_show_defaults, show, show_inputs
 from .view import View
 
-NAME, VERSION = "Holoreel Field Reel", 2
+NAME, VERSION = "Holoreel Field Reel", 3
 SAMPLE = "Holoreel Field Frame"
 FIELD_PANEL = "Field"
 PREFIX = "field_"

@@ -36,7 +36,7 @@ __all__ = [
 NAME = "Holoreel Reel"
 
 
-@node_group(NAME, 8, "Play Spacetime Gaussians on the timeline")
+@node_group(NAME, 9, "Play Spacetime Gaussians on the timeline")
 def reel(tree: Tree) -> None:
     """Takes the points of `attributes.TABLE`."""
     cloud = tree.geometry_input()

@@ -67,6 +67,13 @@ def show_inputs(tree: Tree) -> dict[str, Any]:
             False,
             LOOK_PANEL,
         ),
+        "Holoreel Engine": tree.boolean_input(
+            "Holoreel Engine",
+            "Make nothing for renders, because the Holoreel engine draws the reel from its file; follows the scene's "
+            "render engine by itself",
+            False,
+            LOOK_PANEL,
+        ),
     }
     shown |= camera_inputs(tree)
     for look in LOOKS.values():
@@ -80,7 +87,7 @@ def set_show_defaults(tree: Tree, look: str = SPLATS) -> None:
         tree.set_menu_default(name, item)
 
 
-@node_group("Holoreel Show", 4, "Crop evaluated points, choose their colors, and show them in one of the looks")
+@node_group("Holoreel Show", 5, "Crop evaluated points, choose their colors, and show them in one of the looks")
 def show_group(tree: Tree) -> None:
     """The inputs are those of `show_inputs`."""
     cloud = tree.geometry_input()
@@ -96,7 +103,10 @@ def show_group(tree: Tree) -> None:
     faced = tree.choose(Boolean(tree, view["Is There"]), shown[SPLATS][1], simple, "GEOMETRY")
     shown[SPLATS] = (shown[SPLATS][0], faced)
     rendered = tree.switch(inputs["Look"], shown, "GEOMETRY")
-    tree.output("Geometry", tree.choose(Boolean(tree, view["Opaque"]), simple, rendered, "GEOMETRY"), "What renders")
+    rendered = tree.choose(Boolean(tree, view["Opaque"]), simple, rendered, "GEOMETRY")
+    in_viewport = Boolean(tree, tree.node("GeometryNodeIsViewport").outputs[0])
+    rendered = tree.unless(inputs["Holoreel Engine"] & ~in_viewport, rendered)
+    tree.output("Geometry", rendered, "What renders")
     set_show_defaults(tree)
 
 

@@ -366,6 +366,27 @@ def test_a_scene_without_reels_is_its_background(tmp_path: Path) -> None:
     assert (png(tmp_path) == (51, 102, 255)).all()
 
 
+@pytest.mark.parametrize("kind", ["lite", "field"])
+def test_the_engine_does_not_wait_for_looks_but_viewports_have_them(
+    kind: str, files: dict[str, Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The engine draws reels from their files, so that in its renders their nodes make nothing."""
+    look(bpy.context.scene)
+    played = play(FIELD if kind == "field" else files[kind])
+    set_input(reels.modifier_of(played), "Look", POINTS)
+
+    def count(depsgraph: bpy.types.Depsgraph) -> int:
+        geometry = played.evaluated_get(depsgraph).evaluated_geometry()  # its parts live as long as it does
+        return 0 if geometry.pointcloud is None else len(geometry.pointcloud.points)
+
+    rendered = []
+    monkeypatch.setattr(engine, "shot_of", lambda depsgraph, camera, **_: rendered.append(count(depsgraph)))
+    bpy.ops.holoreel.setup_engine()
+    bpy.ops.render.render()
+    assert rendered == [0]
+    assert count(bpy.context.evaluated_depsgraph_get()) > 0
+
+
 # --- Together with Cycles -------------------------------------------------------------------------------------------
 
 
