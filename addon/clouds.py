@@ -92,9 +92,14 @@ def store_beside(cloud: bpy.types.PointCloud, path: Path) -> bpy.types.PointClou
 
     Raises `HoloreelError` if the file cannot be written.
     """
+    name = cloud.name
     _rename(cloud, STORED)
-    with atomic_path(path) as temporary:
-        bpy.data.libraries.write(str(temporary), {cloud}, fake_user=True)
+    try:
+        with atomic_path(path) as temporary:
+            _write(temporary, path, cloud)
+    except HoloreelError:
+        cloud.name = name
+        raise
     for library in bpy.data.libraries:
         if Path(bpy.path.abspath(library.filepath)) == path:
             library.reload()  # other reels show the new points as well
@@ -118,6 +123,15 @@ def missing_library(cloud: bpy.types.PointCloud) -> str | None:
     if cloud.library is None or not cloud.is_missing:
         return None
     return f"{Path(bpy.path.abspath(cloud.library.filepath)).name} with the points is missing"
+
+
+def _write(temporary: Path, path: Path, cloud: bpy.types.PointCloud) -> None:
+    try:
+        bpy.data.libraries.write(str(temporary), {cloud}, fake_user=True)
+    except OSError as error:  # what Blender says of it is the reason of something else
+        raise HoloreelError(
+            f"{path} cannot be written: make room on its disk, allow writing there, or leave the points in this file."
+        ) from error
 
 
 def _rename(cloud: bpy.types.PointCloud, name: str) -> None:

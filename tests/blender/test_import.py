@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Importing: several files, segments, detail, transforms, undo, drag and drop; reels that move or change."""
 
+import signal
+import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -218,6 +220,29 @@ def test_reloading_keeps_what_was_set(random_model: Model, tmp_path: Path) -> No
     assert bpy.ops.holoreel.relink_reel(filepath=str(tmp_path / "b.reel")) == {"FINISHED"}
     assert len(created.data.points) == 30
     assert reels.source_of(created).name == "b.reel"
+
+
+@pytest.mark.usefixtures("registered")
+@pytest.mark.skipif(sys.platform == "win32", reason="no limits of file sizes")
+def test_no_room_for_points_beside_the_reel_changes_nothing(random_model: Model, tmp_path: Path) -> None:
+    import resource
+
+    save_gaussians(tmp_path / "a.reel", random_model(20_000), fps=24, frame_start=1, frame_count=5)
+    assert bpy.ops.holoreel.import_reel(filepath=str(tmp_path / "a.reel")) == {"FINISHED"}
+    cloud = bpy.context.object.data
+    before = sorted(tmp_path.iterdir())
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    signalled = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, hard))
+    try:
+        with pytest.raises(RuntimeError, match=r"a\.reel\.blend cannot be written: make room"):
+            bpy.ops.holoreel.store_beside()
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+        signal.signal(signal.SIGXFSZ, signalled)
+    assert (bpy.context.object.data, cloud.name, cloud.library, len(cloud.points)) == (cloud, "a", None, 20_000)
+    assert sorted(tmp_path.iterdir()) == before
+    assert bpy.ops.holoreel.store_beside() == {"FINISHED"}
 
 
 @pytest.mark.usefixtures("registered")
