@@ -8,10 +8,13 @@ import json
 import os
 import struct
 import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 import pytest
+from holoreel.core.capture.images import load_picture
 from holoreel.core.gaussians.model import SpacetimeGaussians
 from holoreel.core.reel import save_gaussians
 
@@ -92,6 +95,35 @@ def test_commands(blender: Run, reel: Path, tmp_path: Path) -> None:
     assert (tmp_path / "saved-0007.png").is_file()
     absent = blender(*command, "import", tmp_path / "absent.reel", "--out", scene, status=2)
     assert "absent.reel" in absent.stderr + absent.stdout
+
+
+def test_the_engine_renders_an_animation(blender: Run, reel: Path, tmp_path: Path) -> None:
+    """As a render farm would call it; the worker runs in $HOLOREEL_PYTHON, or else in this very environment."""
+    python = os.environ.get("HOLOREEL_PYTHON", sys.executable)
+    seen = blender("--background", "--python-expr", f"import os; print('seen:', os.access({python!r}, os.X_OK))")
+    if "seen: True" not in seen.stdout:  # it may live in a room of its own
+        pytest.skip(f"this Blender cannot see {python}")
+    scene = tmp_path / "scene.blend"
+    blender("--background", "--command", "holoreel", "import", reel, "--out", scene, "--set-scene-timing")
+    prepare = f"""
+import bpy
+scene = bpy.context.scene
+camera = bpy.data.objects.new("Camera", bpy.data.cameras.new("Camera"))
+camera.rotation_euler = (3.141592653589793, 0.0, 0.0)
+scene.collection.objects.link(camera)
+scene.camera = camera
+bpy.ops.holoreel.setup_engine()
+scene.render.resolution_x, scene.render.resolution_y = 48, 32
+bpy.ops.wm.save_as_mainfile(filepath={str(scene)!r})
+"""
+    blender("--background", scene, "--python-exit-code", "1", "--python-expr", prepare)
+    frames = ["--render-output", tmp_path / "frame-####", "--frame-start", "6", "--frame-end", "7", "--render-anim"]
+    blender("--background", scene, *frames, HOLOREEL_PYTHON=python)
+    pictures = [load_picture(tmp_path / f"frame-000{frame}.png")[..., :3] for frame in (6, 7)]
+    assert all(picture.shape == (32, 48, 3) and picture.max() > 30 for picture in pictures)
+    assert np.abs(np.subtract(*pictures, dtype=int)).max() > 2
+    failed = blender("--background", scene, *frames, HOLOREEL_PYTHON="/none", status=1)
+    assert "/none" in failed.stderr + failed.stdout
 
 
 def test_command_render(blender: Run, reel: Path, tmp_path: Path) -> None:
